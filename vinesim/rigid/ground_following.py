@@ -13,7 +13,6 @@ import math
 import mujoco
 import numpy as np
 
-from vinesim.core import frames
 from vinesim.rigid import recompile
 from vinesim.scene.terrain import Terrain
 
@@ -92,11 +91,7 @@ class GroundFollower:
     def standing(self, base: np.ndarray) -> np.ndarray:
         """Returns height [m], pitch and roll [rad] [..., 3] of a base that stands at ``base`` [..., 3]: x, y [m] and
         yaw [rad]."""
-        height, along, across = np.moveaxis(
-            self.terrain.fit_plane(base[..., 0], base[..., 1], base[..., 2], self.footprint), -1, 0
-        )
-        roll = np.arctan2(across, np.sqrt(1.0 + along * along))
-        return np.stack([height, -np.arctan(along), roll], -1)
+        return _attitude(self.terrain.fit_plane(base[..., 0], base[..., 1], base[..., 2], self.footprint))
 
     def place(self, d: mujoco.MjData, base: np.ndarray) -> None:
         """Put the base on the ground at ``base`` [3]: x, y [m] and yaw [rad]; at rest."""
@@ -106,10 +101,12 @@ class GroundFollower:
     def apply_controls(self, d: mujoco.MjData, base: np.ndarray, velocity: np.ndarray, dt: float) -> None:
         """Before a step of ``dt`` [s]: write MuJoCo's controls. ``base`` [3]: x, y [m] and yaw [rad]; ``velocity`` [3]:
         their rates."""
-        now, then = self.standing(np.stack([base, base + dt * velocity]))
+        x, y, yaw = np.stack([base, base + dt * velocity], 1)
+        planes = self.terrain.fit_plane(x, y, yaw, self.footprint)
+        now, then = _attitude(planes)
         d.ctrl[self._actuator] = self._stiffness * then + self._damping * (then - now) / dt
         # MuJoCo's robots are weightless (gravcomp); the tracks have to carry what pulls the robot downhill
-        _, along, across = self.terrain.fit_plane(*base, self.footprint).tolist()
+        _, along, across = planes[0].tolist()
         c = math.cos(base[2])
         s = math.sin(base[2])
         level = 1.0 / math.sqrt(1.0 + along * along + across * across)  # cosine of the incline
@@ -134,8 +131,14 @@ class GroundFollower:
         z, pitch, roll = d.qpos[self._q].tolist()
         vz, pitch_rate, roll_rate = d.qvel[self._v].tolist()
         x, y, yaw = base
-        sp, cp, sr, cr = math.sin(0.5 * pitch), math.cos(0.5 * pitch), math.sin(0.5 * roll), math.cos(0.5 * roll)
-        turn = frames.multiply(frames.from_yaw(yaw), np.array([cp * sr, sp * cr, -sp * sr, cp * cr]))
+        # the product of the quaternions of yaw, pitch and roll, in Python floats: ten times as fast as frames.multiply
+        sy, cy, sp, cp, sr, cr = (part(0.5 * angle) for angle in (yaw, pitch, roll) for part in (math.sin, math.cos))
+        turn = (
+            cy * cp * sr - sy * sp * cr,
+            cy * sp * cr + sy * cp * sr,
+            sy * cp * cr - cy * sp * sr,
+            cy * cp * cr + sy * sp * sr,
+        )
         c = math.cos(yaw)
         s = math.sin(yaw)
         level = math.cos(pitch)
@@ -144,4 +147,14 @@ class GroundFollower:
             c * pitch_rate + s * level * roll_rate,
             rate[2] - math.sin(pitch) * roll_rate,
         )
-        return np.concatenate([[x, y, z], turn]), np.array([rate[0], rate[1], vz, *spin])
+        return np.array([x, y, z, *turn]), np.array([rate[0], rate[1], vz, *spin])
+
+
+def _attitude(plane: np.ndarray) -> np.ndarray:
+    """Returns height [m], pitch and roll [rad] [..., 3] of a body on a ``plane`` [..., 3] of
+    :meth:`Terrain.fit_plane`."""
+    along = plane[..., 1]
+    result = plane.copy()
+    result[..., 1] = -np.arctan(along)
+    result[..., 2] = np.arctan2(plane[..., 2], np.sqrt(1.0 + along * along))
+    return result

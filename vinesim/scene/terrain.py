@@ -9,6 +9,7 @@ use the same law (:mod:`vinesim.kernels.ground`), so cameras, lidars, wheels and
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 
@@ -48,12 +49,14 @@ class Terrain:
         """Returns the height [...] m of the ground at ``x``, ``y`` [...] m."""
         x = np.asarray(x, float)
         y = np.asarray(y, float)
-        (low, along_x, along_y), fx, fy, _ = self._cell_at(x, y)
+        (low, along_x, along_y), fx, fy = self._triangle_at(x, y)
         return self.slope[0] * x + self.slope[1] * y + (low + fx * along_x + fy * along_y)
 
     def gradient(self, x: np.ndarray | float, y: np.ndarray | float) -> np.ndarray:
         """Returns the gradient [..., 2] of the height along x and y in the triangle at ``x``, ``y`` [...] m."""
-        (_, along_x, along_y), _, _, inside = self._cell_at(np.asarray(x, float), np.asarray(y, float))
+        x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
+        (_, along_x, along_y), _, _ = self._triangle_at(x, y)
+        inside = [(low <= at) & (at <= high) for at, low, high in zip((x, y), self.origin, self.end, strict=True)]
         across = self.slope[0] + np.where(inside[0], along_x / self.cell, 0.0)
         return np.stack([across, self.slope[1] + np.where(inside[1], along_y / self.cell, 0.0)], -1)
 
@@ -84,14 +87,10 @@ class Terrain:
             [..., 3]: height [m] of the plane at the centre, and its rise [1] along the length and along the width.
         """
         x, y, yaw = (np.asarray(value, float)[..., None] for value in (x, y, yaw))
-        share = np.linspace(-1.0, 1.0, FOOTPRINT_SAMPLES)
-        along, across = (half[k] * grid.ravel() for k, grid in enumerate(np.meshgrid(share, share)))
+        along, across, fit = _samples(*half)
         c = np.cos(yaw)
         s = np.sin(yaw)
-        z = self.height(x + c * along - s * across, y + s * along + c * across)
-        # the grid is symmetric, so the three unknowns of the fit are independent
-        rise = ((z * offset).sum(-1) / (offset * offset).sum() for offset in (along, across))
-        return np.stack([z.mean(-1), *rise], -1)
+        return self.height(x + c * along - s * across, y + s * along + c * across) @ fit
 
     def resting_pose(self, x: float, y: float, yaw: float, half: tuple[float, float]) -> np.ndarray:
         """Returns the pose [7] of a stiff rectangle that lies on the ground: in the plane of :meth:`fit_plane`, raised
@@ -104,28 +103,37 @@ class Terrain:
         above = self.height(x + c * u - s * v, y + s * u + c * v) - (height + along * u + across * v)
         return frames.pose([x, y, height + float(above.max())], tilt(yaw, along, across))
 
-    def _cell_at(
+    def _triangle_at(
         self, x: np.ndarray, y: np.ndarray
-    ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """Returns the linear function of the residual in the triangle at ``x``, ``y`` [...] (value at the cell's first
-        node, change along x and along y over a cell), the position in the cell along x and y, from 0 to 1, and whether
-        the point is inside the grid along x and along y."""
+    ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
+        """Returns the linear function of the residual in the triangle at ``x``, ``y`` [...] m (value at the cell's first
+        node, change along x and along y over a cell), and the position in the cell along x and y, from 0 to 1."""
         rows, columns = self.residual.shape
-        u = (x - self.origin[0]) / self.cell
-        v = (y - self.origin[1]) / self.cell
-        inside = (u >= 0.0) & (u <= columns - 1), (v >= 0.0) & (v <= rows - 1)
-        u = np.clip(u, 0.0, columns - 1)
-        v = np.clip(v, 0.0, rows - 1)
+        u = np.minimum(np.maximum((x - self.origin[0]) / self.cell, 0.0), columns - 1)
+        v = np.minimum(np.maximum((y - self.origin[1]) / self.cell, 0.0), rows - 1)
         i = np.minimum(u.astype(int), columns - 2)
         j = np.minimum(v.astype(int), rows - 2)
         fx = u - i
         fy = v - j
-        low = self.residual[j, i].astype(float)
-        right = self.residual[j, i + 1].astype(float)
-        left = self.residual[j + 1, i].astype(float)
-        high = self.residual[j + 1, i + 1].astype(float)
+        node = self.residual.ravel()
+        first = j * columns + i
+        low = node[first].astype(float)
+        high = node[first + (columns + 1)].astype(float)
+        # the third corner is the one to the right of the first below the diagonal, and the one behind it above
         below = fx >= fy
-        return (low, np.where(below, right - low, high - left), np.where(below, high - right, left - low)), fx, fy, inside
+        third = node[first + np.where(below, 1, columns)].astype(float)
+        along = np.where(below, third - low, high - third)
+        return (low, along, high - low - along), fx, fy
+
+
+@functools.lru_cache(64)
+def _samples(half_length: float, half_width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the samples of a rectangle along its length and its width [n] m, and the matrix [n, 3] that turns heights
+    into the plane of :meth:`Terrain.fit_plane`. The grid is symmetric, so the unknowns of the fit are independent."""
+    share = np.linspace(-1.0, 1.0, FOOTPRINT_SAMPLES)
+    along, across = (half * grid.ravel() for half, grid in zip((half_length, half_width), np.meshgrid(share, share), strict=True))
+    fit = [np.full(len(along), 1.0 / len(along)), *(offset / (offset * offset).sum() for offset in (along, across))]
+    return along, across, np.stack(fit, -1)
 
 
 def tilt(yaw: float, along: float, across: float) -> np.ndarray:
