@@ -39,7 +39,8 @@ def test_a_walker_climbs_with_the_ground_and_each_foot_stands_on_it() -> None:
 def test_a_tracked_person_stands_on_the_ground_below() -> None:
     root = on_ground(TERRAIN, frames.pose([0.5, 0.5, 0.0]))
     human = TrackedHuman(root, terrain=TERRAIN)
-    head = human.pose.head + [0.6, 0.0, 0.12, 0, 0, 0, 0]  # the headset has moved uphill
+    head = human.pose.head.copy()
+    head[:3] += 0.6, 0.0, 0.12  # the headset has moved uphill
     human.take(TrackedPoints(head))
     for k in range(100):
         pose = human(0.01 * k)

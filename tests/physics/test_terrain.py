@@ -13,6 +13,7 @@ import pytest
 from tests.support.robot_yard import Yard
 from tests.support.terrain_scenes import bare, hills, incline
 from vinesim.core import frames
+from vinesim.rigid.human_posture import standing_pose
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.rigid.robot_body import RobotBody
 from vinesim.rigid.static_world import ROBOT_CODES
@@ -24,7 +25,6 @@ from vinesim.scene.cane import CaneBuilder
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.terrain import Terrain
 from vinesim.scene.values import HumanSpec
-from vinesim.rigid.human_posture import standing_pose
 from vinesim.world import Physics
 
 GRAVITY = 9.81
@@ -211,9 +211,8 @@ def test_on_an_incline_speed_and_instruments_are_those_of_the_surface(vinebot: R
     level = frames.multiply(frames.conjugate(samples[0].base_q[3:]), samples[0].imus[0].orientation)
     assert turn == pytest.approx(level, abs=1e-3)  # the unit is fixed to the body, or to a still head
     assert last.odom_q[:3] == pytest.approx(
-        frames.rotate(
-            frames.conjugate(samples[0].base_q[3:]), last.base_q[:3] - samples[0].base_q[:3]
-        ) + samples[0].odom_q[:3],
+        frames.rotate(frames.conjugate(samples[0].base_q[3:]), last.base_q[:3] - samples[0].base_q[:3])
+        + samples[0].odom_q[:3],
         abs=2e-3,
     )
 

@@ -105,7 +105,8 @@ def test_roughness_has_the_deviation_and_the_wavelength_of_the_scene() -> None:
     per_metre = np.fft.rfftfreq(terrain.residual.shape[1], terrain.cell)
     assert spectrum[per_metre > 1.0 / 0.8].sum() < 0.02 * spectrum.sum()
     again, other = build_terrain(with_terrain(table)), msgspec.structs.replace(with_terrain(table), seed=9)
-    assert again is not None and (again.residual == terrain.residual).all()
+    assert again is not None
+    assert (again.residual == terrain.residual).all()
     assert (build_terrain(other).residual != terrain.residual).any()  # type: ignore[union-attr]
 
 
@@ -134,7 +135,10 @@ def test_heights_come_from_an_image(tmp_path: pathlib.Path, bits: int, kind: typ
         ("range = [0.0, 2.0]", "terrain.range is given without terrain.image; add image = ..., or remove range"),
         ("margin = 50.0\ncell = 0.02", "million heights; give 0.0"),
         ("ruts = { depth = 0.3, width = 0.4 }", "terrain.ruts.width is 0.4 m; give 0.92 m or more"),
-        ("ruts = { gauge = 2.4 }", "terrain.ruts.gauge is 2.4 m; give 0.35 m (their width) or more, and at most 2.25 m"),
+        (
+            "ruts = { gauge = 2.4 }",
+            "terrain.ruts.gauge is 2.4 m; give 0.35 m (their width) or more, and at most 2.25 m",
+        ),
         ("roughness = { wavelength = 0.3 }", "a quarter of the roughness' wavelength"),
         ("bumps = 3", "terrain.bumps is not a field"),
     ],

@@ -1,5 +1,5 @@
-"""A robot drives along a row on a slope of 10 % with ruts: what its body, its inertial unit, its odometry, its camera and
-its lidar say agrees with the heights of the ground, within their noise."""
+"""A robot drives along a row on a slope of 10 % with ruts: its body, inertial unit, odometry, camera and lidar agree with
+the heights of the ground, within their noise."""
 
 from __future__ import annotations
 
@@ -64,7 +64,9 @@ def depth_errors(terrain: Terrain, primitives: Primitives, pose: np.ndarray) -> 
     camera = Camera(spec, spec.info("eyes", size=(160, 120)), quality="fast")
     frame = camera.render(primitives, pose, outputs=CameraOutput.ALL & ~CameraOutput.BUNCHES)
     v, u = np.mgrid[: frame.info.height, : frame.info.width]
-    ray = np.stack([(u - frame.info.cx) / frame.info.fx, (v - frame.info.cy) / frame.info.fy, np.ones_like(u, float)], -1)
+    ray = np.stack(
+        [(u - frame.info.cx) / frame.info.fx, (v - frame.info.cy) / frame.info.fy, np.ones_like(u, float)], -1
+    )
     ray = frames.rotate(pose[3:], ray)
     seen = (frame.labels == GROUND) & np.isfinite(frame.depth)
     exact = pose[:3] + ray[seen] * np.asarray(frame.exact_depth)[seen, None]
@@ -113,7 +115,9 @@ def check_drive(length: float, looks: int) -> None:
             plane.append([here[2] - height, *(up - frames.rotate(frames.from_yaw(frames.to_yaw(here[3:])), tilted))])
             turned = frames.log(frames.multiply(frames.conjugate(last[3:]), here[3:])) / rigid.dt
             gyro.append(imu.angular_velocity - turned)
-            accelerometer.append([*imu.linear_acceleration, *frames.rotate(frames.conjugate(imu.orientation), [0, 0, 1])])
+            accelerometer.append(
+                [*imu.linear_acceleration, *frames.rotate(frames.conjugate(imu.orientation), [0, 0, 1])]
+            )
             climbs.append(ahead[2] / np.sqrt(1.0 - ahead[2] ** 2) - along)
         last = here.copy()
         if here[0] > length * (0.5 + len(errors)) / looks:
@@ -139,7 +143,9 @@ def check_drive(length: float, looks: int) -> None:
     assert np.abs(measured - true).max() < 5e-3
     assert np.linalg.norm(seconds[:, :3], axis=1) == pytest.approx(GRAVITY, abs=0.05)
     # odometry: travel along the surface, and more of it lost where it is steeper
-    assert travel == pytest.approx(np.hypot(last[0], last[2] - terrain.fit_plane(0.0, 1.3, 0.0, footprint)[0]), rel=5e-3)
+    assert travel == pytest.approx(
+        np.hypot(last[0], last[2] - terrain.fit_plane(0.0, 1.3, 0.0, footprint)[0]), rel=5e-3
+    )
     assert robot.sample(time).odom_q[0] == pytest.approx(lost, rel=2e-3)
     # the camera's depth and the lidar's ranges: without bias, and as noisy as their data sheets say
     depth = np.concatenate(errors)

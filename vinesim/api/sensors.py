@@ -128,7 +128,10 @@ class Camera:
             )
             self._last = simulation
         return _as(
-            Picture, self._camera.render(simulation.primitives(), _sensor_pose(pose, robot, frame, simulation.model.terrain), simulation.time)
+            Picture,
+            self._camera.render(
+                simulation.primitives(), _sensor_pose(pose, robot, frame, simulation.model.terrain), simulation.time
+            ),
         )
 
 
@@ -167,7 +170,9 @@ class Lidar:
         device = simulation.device
         if device not in self._lidars:
             self._lidars[device] = lidar.Lidar(self.spec, self._name, seed=self._seed, device=device)
-        made = self._lidars[device].scan(simulation.primitives(), _sensor_pose(pose, robot, frame, simulation.model.terrain), simulation.time)
+        made = self._lidars[device].scan(
+            simulation.primitives(), _sensor_pose(pose, robot, frame, simulation.model.terrain), simulation.time
+        )
         return _as(Scan, made)
 
 

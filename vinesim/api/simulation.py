@@ -296,7 +296,9 @@ class Simulation:
         name = name or f"robot_{index}"
         if name in self.physics.rigid.robots:
             raise UsageError(f"robot {name!r} exists already; give another name")
-        self.robots[name] = added = Robot(self.physics.rigid, described, name, index, base_pose(pose, self.model.terrain))
+        self.robots[name] = added = Robot(
+            self.physics.rigid, described, name, index, base_pose(pose, self.model.terrain)
+        )
         self._robots_added += 1
         added.fit_cutters(self.physics)
         return added

@@ -37,8 +37,8 @@ class RigidGeoms:
     body: np.ndarray
     """[geom] index of the geom's MuJoCo body."""
     kind: np.ndarray
-    """[geom] MuJoCo's type: 0 plane, 1 tile of uneven ground, 2 sphere, 3 capsule, 4 ellipsoid, 5 cylinder, 6 box, 7 mesh. A flat mesh is
-    replaced by its bounding box."""
+    """[geom] MuJoCo's type: 0 plane, 1 tile of uneven ground, 2 sphere, 3 capsule, 4 ellipsoid, 5 cylinder, 6 box, 7
+    mesh. A flat mesh is replaced by its bounding box."""
     hull: np.ndarray
     """[geom] index of the convex hull in :func:`hull_arrays`; -1 if the geom has none."""
     size: np.ndarray
@@ -204,7 +204,8 @@ def hull_numbers(m: mujoco.MjModel, ids: np.ndarray) -> np.ndarray:
 
 
 def hull_arrays(m: mujoco.MjModel, terrain: Terrain | None = None) -> SharedArrays:
-    """Returns the convex hulls of all meshes of a world, and uneven ground; a mesh without a hull has an empty entry."""
+    """Returns the convex hulls of all meshes of a world, and its uneven ground; a mesh without a hull has an empty
+    entry."""
     planes = [np.zeros((0, 4))]
     edges = [np.zeros((0, 2, 3))]
     sides = [np.zeros((0, 2), int)]

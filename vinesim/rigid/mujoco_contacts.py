@@ -80,9 +80,7 @@ def let_links_collide(parsed: mujoco.MjSpec, given: RobotSpec, code: int, cleara
         geom.name = str(number)
         geom.contype = geom.conaffinity = 1
         geom.margin = HOME_CLEARANCE
-    ground = alone.worldbody.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0.0, 0.0, -clearance]
-    )
+    ground = alone.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0.0, 0.0, -clearance])
     ground.contype = ground.conaffinity = 1
     m = compile_without_contacts(alone)
     geoms = _touching_at_home(m, given)

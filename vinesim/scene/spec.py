@@ -307,7 +307,7 @@ def _find_terrain_error(scene: Scene) -> str:
         steep = _RUT_STEEPNESS * ruts.depth / (0.5 * ruts.width)
         if steep > MAX_SIDE_SLOPE:
             least = _RUT_STEEPNESS * ruts.depth / (0.5 * MAX_SIDE_SLOPE)
-            return f"terrain.ruts.width is {ruts.width} m; give {least:.2f} m or more, or ruts shallower than {ruts.depth} m"
+            return f"terrain.ruts.width is {ruts.width} m; give {least:.2f} m or more, or a depth below {ruts.depth} m"
         if ruts.gauge + ruts.width > layout.row_spacing or ruts.width > ruts.gauge:
             return (
                 f"terrain.ruts.gauge is {ruts.gauge} m; give {ruts.width} m (their width) or more, and at most "

@@ -1,9 +1,10 @@
 """The uneven ground of a scene: heights on a regular grid, and the one law by which every consumer interpolates them.
 
 The height at (x, y) is that of an inclined plane plus an interpolated *residual*. The residual is given at the nodes of
-a grid; each cell is two triangles, divided by the diagonal from its lowest x and y to its highest, as MuJoCo divides the
-cells of its height fields. Beyond the grid the residual of the nearest edge continues, and so does the plane. Kernels
-use the same law (:mod:`vinesim.kernels.ground`), so cameras, lidars, wheels and boxes meet the same triangles.
+a grid; each cell is two triangles, divided by the diagonal from its lowest x and y to its highest, as MuJoCo divides
+the cells of its height fields. Beyond the grid the residual of the nearest edge continues, and so does the plane.
+Kernels use the same law (:mod:`vinesim.kernels.raster.ground`, :mod:`vinesim.kernels.contact.ground_distance`), so
+cameras, lidars, plants, wheels and boxes meet the same triangles.
 """
 
 from __future__ import annotations
@@ -106,8 +107,8 @@ class Terrain:
     def _triangle_at(
         self, x: np.ndarray, y: np.ndarray
     ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
-        """Returns the linear function of the residual in the triangle at ``x``, ``y`` [...] m (value at the cell's first
-        node, change along x and along y over a cell), and the position in the cell along x and y, from 0 to 1."""
+        """Returns the linear function of the residual in the triangle at ``x``, ``y`` [...] m (value at the cell's
+        first node, change along x and along y over a cell), and the position in the cell along x and y, 0 to 1."""
         rows, columns = self.residual.shape
         u = np.minimum(np.maximum((x - self.origin[0]) / self.cell, 0.0), columns - 1)
         v = np.minimum(np.maximum((y - self.origin[1]) / self.cell, 0.0), rows - 1)
@@ -131,7 +132,9 @@ def _samples(half_length: float, half_width: float) -> tuple[np.ndarray, np.ndar
     """Returns the samples of a rectangle along its length and its width [n] m, and the matrix [n, 3] that turns heights
     into the plane of :meth:`Terrain.fit_plane`. The grid is symmetric, so the unknowns of the fit are independent."""
     share = np.linspace(-1.0, 1.0, FOOTPRINT_SAMPLES)
-    along, across = (half * grid.ravel() for half, grid in zip((half_length, half_width), np.meshgrid(share, share), strict=True))
+    along, across = (
+        half * grid.ravel() for half, grid in zip((half_length, half_width), np.meshgrid(share, share), strict=True)
+    )
     fit = [np.full(len(along), 1.0 / len(along)), *(offset / (offset * offset).sum() for offset in (along, across))]
     return along, across, np.stack(fit, -1)
 

@@ -195,9 +195,7 @@ def fill_crate(physics: Physics, number: int, crate: CratePlacement) -> list[int
             if physics.state.bunch_attached[bunch]:
                 physics.pick(bunch)
             top = max([CRATE_WALL, *(_top_height(physics, other) for other in inside_it)])
-            rigid.place_bunch(
-                bunch, frames.compose(pose, _drop_pose(model, bunch, inside, top, rng)), np.zeros(6)
-            )
+            rigid.place_bunch(bunch, frames.compose(pose, _drop_pose(model, bunch, inside, top, rng)), np.zeros(6))
             inside_it.append(bunch)
             _step_rigid(rigid, FALL_STEPS)
         _step_rigid(rigid, SETTLE_STEPS)

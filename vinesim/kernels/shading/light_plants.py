@@ -248,9 +248,7 @@ def uneven_ground_light(
     pixel = z * 2.0 / lens.fx
     rise = ground_relief(materials.ground, p[0], p[1])
     incidence = (ray[2] - rise[0] * ray[0] - rise[1] * ray[1]) / (scale * wp.sqrt(1.0 + wp.dot(rise, rise)))
-    return soil_light(
-        tables, materials, light, maps, p, rise, pixel, pixel / wp.max(-incidence, 1.0e-3), z * scale
-    )
+    return soil_light(tables, materials, light, maps, p, rise, pixel, pixel / wp.max(-incidence, 1.0e-3), z * scale)
 
 
 @wp.func

@@ -18,7 +18,7 @@ LEAST_VARIANCE = 1e-6
 GUESSED: the variance of encoders with a resolution of a millimetre."""
 
 SLOPE_SLIP = 0.1
-"""[1] Share of the travel that is lost on an incline, over the tangent of the incline. DERIVED: at small slip a track of
+"""[1] Share of the travel that is lost on an incline, over the incline's tangent. DERIVED: at small slip a track of
 length L = 1 m on soil with the shear deformation modulus K = 2 cm loses 2 K / L of its travel at full traction (Wong
 2008, Theory of Ground Vehicles, 2.4; K is 1 to 2.5 cm on firm soil), and full traction climbs an incline of 0.4
 (data/robots/vinebot.toml)."""

@@ -147,7 +147,9 @@ class RemoteRobot(RobotInstance):
     def _teleport(self, update: RobotUpdate, here: np.ndarray) -> None:
         """Place the copy at the state of ``update``. ``here`` [7]: present pose of its base."""
         is_level = self.rigid.model.terrain is None
-        if is_level and abs(update.base_q[2] - here[2]) > 1e-3:  # the base joint is planar, so another height needs a new body
+        if (
+            is_level and abs(update.base_q[2] - here[2]) > 1e-3
+        ):  # the base joint is planar, so another height needs a new body
             self.rigid.remove_robot(self.name)
             self._shown_color = None
             self.rigid.add_robot(self.description.to_spec(self.name, self._index, update.base_q))

@@ -95,8 +95,12 @@ def _smooth_noise(
     coefficients = rng.standard_normal((deep, wide)) / SPLINE_DEVIATION
     across = _spline((x - low[0]) / step, wide)
     along = _spline((y - low[1]) / step, deep)
-    rows = sum(weight[:, None] * coefficients[index] for index, weight in along)
-    noise = sum(weight * rows[:, index] for index, weight in across)
+    rows = np.zeros((len(y), wide))
+    for index, weight in along:
+        rows += weight[:, None] * coefficients[index]
+    noise = np.zeros((len(y), len(x)))
+    for index, weight in across:
+        noise += weight * rows[:, index]
     return roughness.deviation * noise
 
 
@@ -124,9 +128,7 @@ class TrellisRise:
     def __init__(self, terrain: Terrain, layout: Layout) -> None:
         half = 0.5 * np.array([layout.vine_spacing, layout.row_spacing])
         lines = []
-        for k, (count, spacing) in enumerate(
-            ((layout.vines, layout.vine_spacing), (layout.rows, layout.row_spacing))
-        ):
+        for k, (count, spacing) in enumerate(((layout.vines, layout.vine_spacing), (layout.rows, layout.row_spacing))):
             at = spacing * np.arange(count)
             lines.append(np.concatenate([[-half[k]], at, [at[-1] + half[k]]]))
         self._lines = lines

@@ -58,7 +58,9 @@ def generate(scene: Scene) -> Model:
     )
     if terrain is not None:  # the path of an image must not change the digest, but its content must
         plants = msgspec.structs.replace(plants, terrain=None)
-    ground = None if terrain is None else (repr(terrain.origin), terrain.cell, terrain.slope, terrain.residual.tobytes())
+    ground = (
+        None if terrain is None else (repr(terrain.origin), terrain.cell, terrain.slope, terrain.residual.tobytes())
+    )
     imported = [(load_imported_plant(one.file), msgspec.structs.replace(one, file="")) for one in scene.imported]
     digest = disk_cache.source_digest(_code_digest(), msgspec.json.encode((plants, parameters, imported, ground)))
     return Model(terrain=terrain, **disk_cache.load_or_make("vineyard", digest, make)).check()
