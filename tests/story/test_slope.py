@@ -1,4 +1,4 @@
-"""A robot drives along a row on a slope of 10 % with ruts: its body, inertial unit, odometry, camera and lidar agree with
+"""A robot drives along a row on a slope of 10 % with ruts. Its body, inertial unit, odometry, camera and lidar agree with
 the heights of the ground, within their noise."""
 
 from __future__ import annotations
