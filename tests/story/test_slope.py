@@ -1,5 +1,5 @@
-"""A robot drives along a row on a slope of 10 % with ruts. Its body, inertial unit, odometry, camera and lidar agree with
-the heights of the ground, within their noise."""
+"""A robot drives along a row on a slope of 10 % with ruts. Its body, inertial unit, odometry, camera and lidar agree
+with the heights of the ground, within their noise."""
 
 from __future__ import annotations
 
