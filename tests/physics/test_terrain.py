@@ -22,9 +22,13 @@ from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.odometry import SLOPE_SLIP
 from vinesim.scene.builder import assemble
 from vinesim.scene.cane import CaneBuilder
+from vinesim.scene.generation.vineyard import generate_uncached
 from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.scene.spec import TerrainTable, load_scene
+from vinesim.scene.state import State
 from vinesim.scene.terrain import Terrain
 from vinesim.scene.values import HumanSpec
+from vinesim.wind.shelter import TreeDrag
 from vinesim.world import Physics
 
 GRAVITY = 9.81
@@ -311,3 +315,14 @@ def test_without_terrain_a_base_has_three_joints(vinebot: RobotDescription) -> N
     assert joints == [3, 3]
     count = [Yard(vinebot, None, terrain).rigid.mj_model.nv for terrain in (None, incline(0.0))]
     assert count[1] == count[0] + 3
+
+
+def test_the_wind_at_a_plant_depends_on_its_height_above_the_ground() -> None:
+    scene = load_scene("vsp")
+    small = msgspec.structs.replace(scene, layout=msgspec.structs.replace(scene.layout, rows=2, vines=2))
+    models = [
+        generate_uncached(msgspec.structs.replace(small, terrain=table)) for table in (None, TerrainTable(slope=0.4))
+    ]
+    level, slope = (TreeDrag.of(model, State.at_rest(model).body_q) for model in models)
+    assert slope.profile == pytest.approx(level.profile, rel=0.15)
+    assert slope.depth == pytest.approx(level.depth, rel=0.1)

@@ -133,7 +133,7 @@ def test_heights_come_from_an_image(tmp_path: pathlib.Path, bits: int, kind: typ
         ("image = 'none.png'", "terrain.image is 'none.png', which cannot be read; give a grey PNG of 8 or 16 bits"),
         ("cell = 1.0", "terrain.cell is 1.0 m; give 0.117 m or less, a third of a rut's width"),
         ("range = [0.0, 2.0]", "terrain.range is given without terrain.image; add image = ..., or remove range"),
-        ("margin = 50.0\ncell = 0.02", "million heights; give 0.0"),
+        ("margin = 50.0\ncell = 0.02", "million heights; give 0.11 m or more"),
         ("ruts = { depth = 0.3, width = 0.4 }", "terrain.ruts.width is 0.4 m; give 0.92 m or more"),
         (
             "ruts = { gauge = 2.4 }",

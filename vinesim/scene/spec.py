@@ -288,7 +288,7 @@ def _find_error(scene: Scene) -> str:
     return ""
 
 
-MAX_NODES = 4_000_000
+MAX_NODES = 1_000_000
 """Largest number of nodes of uneven ground."""
 MAX_SIDE_SLOPE = 1.0
 """[1] Steepest side of a rut, 45 degrees. GUESSED: moist soil slides off steeper sides."""
@@ -324,7 +324,7 @@ def _find_terrain_error(scene: Scene) -> str:
     ]
     nodes = size[0] * size[1] / table.cell**2
     if nodes > MAX_NODES:
-        least = math.sqrt(size[0] * size[1] / MAX_NODES)
+        least = math.ceil(100.0 * math.sqrt(size[0] * size[1] / MAX_NODES)) / 100.0
         return f"terrain.cell is {table.cell} m, {nodes / 1e6:.0f} million heights; give {least:.2f} m or more"
     low, high = table.range
     if not -100.0 <= low < high <= 100.0:
