@@ -20,7 +20,11 @@ from vinesim.sensors.export.images import look_at
 from vinesim.sensors.primitives.scene_primitives import Primitives
 from vinesim.web.page_server import PageServer
 
-VIEWS = {"demo": ((-0.6, 0.3, 1.5), (0.4, 0.75, 1.78)), "vsp": ((0.4, 1.0, 0.95), (0.5, 0.0, 1.0))}
+VIEWS = {
+    "demo": ((-0.6, 0.3, 1.5), (0.4, 0.75, 1.78)),
+    "vsp": ((0.4, 1.0, 0.95), (0.5, 0.0, 1.0)),
+    "slope": ((1.6, 0.9, 1.2), (2.0, 0.0, 1.1)),
+}
 """By scene: where the eyes are, and a point that they look at [m]: bunches, leaves and wood are near."""
 SIZE = (480, 270)
 KINDS = {

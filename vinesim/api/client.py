@@ -86,7 +86,7 @@ class Client:
                 (queue,) = choose_places(self.scene, self.model, bus, number=spawn)
                 place = start_pose(self.scene, spawn or 0, queue=queue)
             else:
-                place = base_pose(pose)
+                place = base_pose(pose, self.model.terrain)
             executor = stack.enter_context(ThreadPoolExecutor(1, "spawner"))
             self._client = RobotClient(
                 self.scene, self.model, described, bus, name=name, pose=place, executor=executor, device=device

@@ -27,6 +27,7 @@ from vinesim.scene.generation.vineyard import generate_uncached
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene, Season, sun_direction
+from vinesim.scene.terrain import ground_height
 from vinesim.scene.values import CameraInfo, RenderedMount, Snapshot
 from vinesim.sensors import ground_truth
 from vinesim.sensors.camera.camera import Camera, CameraSpec
@@ -266,6 +267,7 @@ class VineyardRenderer:
             if actors and attempt < _TRIES_WITH_ACTORS:  # look from the side opposite to an actor
                 behind = np.array(actors[rng.integers(len(actors))]) - middle[:2]
                 around = np.arctan2(-behind[1], -behind[0]) + rng.normal(0.0, 0.3)
+            height += float(ground_height(model.terrain, *middle[:2]))
             rise = height - middle[2]
             level = np.sqrt(max(away**2 - rise**2, rise**2))  # never steeper than 45 degrees
             eye = np.array([*(middle[:2] + level * np.array([np.cos(around), np.sin(around)])), height])

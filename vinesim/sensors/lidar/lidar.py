@@ -369,6 +369,7 @@ class Lidar:
                 primitives.labels,
                 primitives.organs,
                 self._receiver,
+                primitives.ground,
                 first * self.lasers,
                 wp.transform(*map(float, pose)),
                 grid.direction,
