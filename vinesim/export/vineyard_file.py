@@ -10,6 +10,7 @@ from collections.abc import Callable
 from vinesim.core.errors import UsageError, writing
 from vinesim.export.articulation import Vineyard, describe
 from vinesim.export.mjcf import mjcf
+from vinesim.export.urdf import urdf
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 
@@ -25,7 +26,7 @@ def _write_xml(document: Callable[[Vineyard], ElementTree.Element]) -> Write:
     return write
 
 
-FORMATS: dict[str, tuple[Write, bool]] = {".xml": (_write_xml(mjcf), False)}
+FORMATS: dict[str, tuple[Write, bool]] = {".xml": (_write_xml(mjcf), False), ".urdf": (_write_xml(urdf), False)}
 """Writer of each suffix, and whether the hinges of a joint must be orthogonal."""
 
 
