@@ -18,10 +18,11 @@ def export_vineyard(source: Source, file: str | os.PathLike[str], *, leaves: boo
 
     Args:
         source: a model; a scene; the name or the file of a scene; one or more builders of canes or trees.
-        file: MJCF (``.xml``).
+        file: MJCF (``.xml``), URDF (``.urdf``), or OpenUSD (``.usda``, ``.usdc``, ``.usd``; needs the extra ``export``).
         leaves: whether leaves are drawn. They never collide; their mass is always part of their cane.
 
     Raises:
+        UsdMissing: usd-core is not installed.
         UsageError: the suffix is unknown, or the folder of the file does not exist.
         WriteError: the file cannot be written.
     """

@@ -11,6 +11,7 @@ from vinesim.core.errors import UsageError, writing
 from vinesim.export.articulation import Vineyard, describe
 from vinesim.export.mjcf import mjcf
 from vinesim.export.urdf import urdf
+from vinesim.export.usd import write_usd
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 
@@ -26,7 +27,13 @@ def _write_xml(document: Callable[[Vineyard], ElementTree.Element]) -> Write:
     return write
 
 
-FORMATS: dict[str, tuple[Write, bool]] = {".xml": (_write_xml(mjcf), False), ".urdf": (_write_xml(urdf), False)}
+FORMATS: dict[str, tuple[Write, bool]] = {
+    ".xml": (_write_xml(mjcf), False),
+    ".urdf": (_write_xml(urdf), False),
+    ".usda": (write_usd, True),
+    ".usdc": (write_usd, True),
+    ".usd": (write_usd, True),
+}
 """Writer of each suffix, and whether the hinges of a joint must be orthogonal."""
 
 
