@@ -90,7 +90,7 @@ class Simulation:
             source = load_scene(source)
         if isinstance(source, Scene):
             self.scene = source
-        model = _model_of(source)
+        model = model_of(source)
         if parameters is not None and not isinstance(parameters, PhysicsParameters):
             raise UsageError(f"parameters is a {type(parameters).__name__}; give PhysicsParameters, or none")
         chosen = parameters or (self.scene.physics if self.scene else PhysicsParameters())
@@ -362,7 +362,8 @@ def base_pose(pose: Sequence[float] | np.ndarray, terrain: Terrain | None = None
     return on_ground(terrain, frames.pose(np.array([given[0], given[1], 0.0]), frames.from_yaw(given[2])))
 
 
-def _model_of(source: Model | Scene | CaneBuilder | TreeBuilder | Iterable[CaneBuilder | TreeBuilder]) -> Model:
+def model_of(source: Model | Scene | CaneBuilder | TreeBuilder | Iterable[CaneBuilder | TreeBuilder]) -> Model:
+    """Returns the model of a source that is no name or file. Raises :class:`UsageError` for other values."""
     if isinstance(source, Model):
         return source
     if isinstance(source, Scene):

@@ -1,4 +1,4 @@
-"""``vinesim scene show``, ``vinesim render`` and ``vinesim dataset``: their options."""
+"""``vinesim scene show``, ``vinesim export``, ``vinesim render`` and ``vinesim dataset``: their options."""
 
 from __future__ import annotations
 
@@ -65,6 +65,30 @@ def scene_import_plant(
         old_wood=old_wood,
     )
     raise typer.Exit(code)
+
+
+def export(
+    scene: Annotated[str, typer.Argument(help="A scene file, or demo, harvest, tendone, vsp.")],
+    out: Annotated[pathlib.Path, typer.Option(help="File to write; its suffix chooses the format: .xml (MJCF), .urdf, .usda, .usdc or .usd.")],
+    seed: Seed = None,
+    leaves: Annotated[
+        bool, typer.Option("--leaves", help="Draw the leaves. They do not collide, and make the file twice as large.")
+    ] = False,
+) -> None:
+    """Write a vineyard for another simulator: bodies on hinges with springs, wood, wires, ground, boxes.
+
+    Masses, the equilibrium under gravity and the frequencies of small vibrations are those of vinesim. A URDF has the
+    springs as elements that Gazebo alone reads. OpenUSD needs vinesim[export].
+
+    \b
+    Examples:
+      vinesim export demo --out vineyard.xml
+      vinesim export vsp --seed 4 --out vsp.usdc
+      vinesim export my-block.toml --leaves --out block.urdf
+    """
+    from vinesim.cli.scene import export_scene
+
+    raise typer.Exit(export_scene(scene, seed, out, leaves))
 
 
 def render(
