@@ -38,7 +38,9 @@ def test_wheels_without_their_library_path_are_refused(monkeypatch):
 @wheels_only
 def test_a_middleware_that_the_wheels_lack_is_refused(monkeypatch):
     monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")
-    assert "RMW_IMPLEMENTATION is 'rmw_cyclonedds_cpp'" in str(middleware.unavailable_reason())
+    assert str(middleware.unavailable_reason()) == (
+        "RMW_IMPLEMENTATION is 'rmw_cyclonedds_cpp', but the ROS 2 wheels have only rmw_fastrtps_cpp; unset it"
+    )
 
 
 def test_without_ros_the_extra_is_named(monkeypatch):
@@ -49,30 +51,34 @@ def test_without_ros_the_extra_is_named(monkeypatch):
 
     monkeypatch.setattr(importlib, "import_module", missing)
     assert middleware.unavailable_reason() == (
-        "ROS 2 is missing (No module named 'rclpy.node'); pip install 'vinesim[ros]', "
-        "or source a ROS 2 Jazzy installation"
+        "ROS 2 is missing (No module named 'rclpy.node'); pip install 'vinesim[ros]', or source a ROS 2 installation"
     )
 
 
 @pytest.mark.ros
 @wheels_only
-def test_the_profile_is_set_unless_the_user_has_chosen(monkeypatch):
-    monkeypatch.delenv(middleware.PROFILE_VARIABLE, raising=False)
+@pytest.mark.parametrize("variable", middleware.PROFILE_VARIABLES)
+def test_the_profile_is_set_unless_the_user_has_chosen(monkeypatch, variable):
+    for each in middleware.PROFILE_VARIABLES:
+        monkeypatch.delenv(each, raising=False)
     monkeypatch.setenv(middleware.RANGE_VARIABLE, "SUBNET")
     middleware.configure()
-    assert os.environ[middleware.PROFILE_VARIABLE].endswith("/shared_memory.xml")
+    assert os.environ[variable].endswith("/shared_memory.xml")
     assert os.environ[middleware.RANGE_VARIABLE] == "SUBNET"
     middleware.configure(large_messages=False)
     middleware.configure()  # as every node does
-    assert os.environ[middleware.PROFILE_VARIABLE].endswith("/udp.xml")
+    version_3 = "" if variable.startswith("FASTRTPS") else "_fast_dds_3"
+    assert os.environ[variable].endswith(f"/udp{version_3}.xml")
     middleware.clear_profile()
-    assert middleware.PROFILE_VARIABLE not in os.environ
+    assert not set(middleware.PROFILE_VARIABLES) & set(os.environ)
     assert os.environ[middleware.RANGE_VARIABLE] == "SUBNET"
 
-    monkeypatch.setenv(middleware.PROFILE_VARIABLE, "/srv/own.xml")
+    monkeypatch.setenv(variable, "/srv/own.xml")
     middleware.configure()
     middleware.clear_profile()
-    assert os.environ[middleware.PROFILE_VARIABLE] == "/srv/own.xml"
+    assert {each: os.environ.get(each) for each in middleware.PROFILE_VARIABLES} == {
+        each: "/srv/own.xml" if each == variable else None for each in middleware.PROFILE_VARIABLES
+    }
 
 
 @pytest.mark.ros
@@ -81,15 +87,16 @@ def test_the_profile_is_set_unless_the_user_has_chosen(monkeypatch):
     ("variable", "value"), [(middleware.RANGE_VARIABLE, "LOCALHOST"), (middleware.LOCALHOST_VARIABLE, "1")]
 )
 def test_discovery_on_this_machine_is_the_profiles(monkeypatch, variable, value):
-    monkeypatch.delenv(middleware.PROFILE_VARIABLE, raising=False)
+    for each in middleware.PROFILE_VARIABLES:
+        monkeypatch.delenv(each, raising=False)
     monkeypatch.setenv(middleware.RANGE_VARIABLE, "SUBNET")
     monkeypatch.setenv(middleware.LOCALHOST_VARIABLE, "0")
     monkeypatch.setenv(variable, value)
     middleware.configure()
-    assert os.environ[middleware.PROFILE_VARIABLE].endswith("/shared_memory_loopback.xml")
+    assert os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"].endswith("/shared_memory_loopback.xml")
     assert not middleware.discovers_this_machine_only()
     middleware.configure(large_messages=False)  # as in a process that was started by this one
-    assert os.environ[middleware.PROFILE_VARIABLE].endswith("/udp_loopback.xml")
+    assert os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"].endswith("/udp_loopback.xml")
     middleware.clear_profile()
     assert os.environ[middleware.RANGE_VARIABLE] == "LOCALHOST"
 
@@ -106,7 +113,7 @@ import rclpy
 rclpy.init()
 node = rclpy.create_node("some_node")
 maps = pathlib.Path("/proc/self/maps").read_text().split()
-segments = {path for path in maps if path.startswith("/dev/shm/fastrtps_") and "port" not in path}
+segments = {path for path in maps if path.startswith(("/dev/shm/fastrtps_", "/dev/shm/fastdds_")) and "port" not in path}
 print(sorted(os.path.getsize(path) for path in segments))
 """
 
@@ -116,7 +123,7 @@ print(sorted(os.path.getsize(path) for path in segments))
 @pytest.mark.parametrize("reach", ["SUBNET", "LOCALHOST"])
 def test_only_nodes_with_pictures_use_shared_memory(reach):
     """Writing to the shared-memory queue of a stopped subscriber takes two seconds, so small topics go by UDP."""
-    environ = {name: value for name, value in os.environ.items() if name != middleware.PROFILE_VARIABLE}
+    environ = {name: value for name, value in os.environ.items() if name not in middleware.PROFILE_VARIABLES}
     environ |= {middleware.RANGE_VARIABLE: reach, "ROS_DOMAIN_ID": str(101 + os.getpid() % 100)}  # without peers
 
     def segments(kind: str) -> list[int]:
@@ -139,3 +146,15 @@ def test_the_segment_holds_several_of_the_largest_messages(local):
     organised_cloud = 640 * 480 * 16
     assert organised_cloud < message < segment
     assert segment >= 4 * organised_cloud
+
+
+@pytest.mark.parametrize("local", [False, True])
+def test_the_profile_of_fast_dds_3_differs_from_that_of_2_in_names_only(local):
+    two, three = (
+        middleware.profile_file(large_messages=False, local=local, version=version).read_text() for version in (2, 3)
+    )
+    names = {"heartbeatPeriod": "heartbeat_period", "nackResponseDelay": "nack_response_delay"}
+    assert all(name in two for name in names)
+    for before, after in names.items():
+        two = two.replace(before, after)
+    assert two == three
