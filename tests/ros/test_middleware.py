@@ -12,10 +12,20 @@ import xml.etree.ElementTree as ElementTree
 import pytest
 
 from tests.support.waiting import deadline
-from vinesim.ros import middleware
+from vinesim.ros import installation, middleware
 
 WHEELS = importlib.util.find_spec("ros_wheels_bootstrapper") is not None
 wheels_only = pytest.mark.skipif(not WHEELS, reason="ROS 2 is not installed as wheels: pip install 'vinesim[ros]'")
+VARIABLE, ENDING = {
+    2: ("FASTRTPS_DEFAULT_PROFILES_FILE", ".xml"),
+    3: ("FASTDDS_DEFAULT_PROFILES_FILE", "_fast_dds_3.xml"),
+}[installation.fast_dds_version()]
+"""Variable with the profile of the Fast DDS that is installed, and the end of the names of its profiles."""
+
+
+def profiles() -> dict[str, str]:
+    """The variables with profiles that are set."""
+    return {name: os.environ[name] for name in middleware.PROFILE_VARIABLES if name in os.environ}
 
 
 @pytest.mark.ros
@@ -57,28 +67,26 @@ def test_without_ros_the_extra_is_named(monkeypatch):
 
 @pytest.mark.ros
 @wheels_only
-@pytest.mark.parametrize("variable", middleware.PROFILE_VARIABLES)
-def test_the_profile_is_set_unless_the_user_has_chosen(monkeypatch, variable):
+def test_the_profile_is_set_unless_the_user_has_chosen(monkeypatch):
     for each in middleware.PROFILE_VARIABLES:
         monkeypatch.delenv(each, raising=False)
     monkeypatch.setenv(middleware.RANGE_VARIABLE, "SUBNET")
     middleware.configure()
-    assert os.environ[variable].endswith("/shared_memory.xml")
+    assert profiles()[VARIABLE].endswith(f"/shared_memory{ENDING}")
     assert os.environ[middleware.RANGE_VARIABLE] == "SUBNET"
     middleware.configure(large_messages=False)
     middleware.configure()  # as every node does
-    version_3 = "" if variable.startswith("FASTRTPS") else "_fast_dds_3"
-    assert os.environ[variable].endswith(f"/udp{version_3}.xml")
+    assert profiles()[VARIABLE].endswith(f"/udp{ENDING}")
     middleware.clear_profile()
-    assert not set(middleware.PROFILE_VARIABLES) & set(os.environ)
+    assert profiles() == {}
     assert os.environ[middleware.RANGE_VARIABLE] == "SUBNET"
 
-    monkeypatch.setenv(variable, "/srv/own.xml")
-    middleware.configure()
-    middleware.clear_profile()
-    assert {each: os.environ.get(each) for each in middleware.PROFILE_VARIABLES} == {
-        each: "/srv/own.xml" if each == variable else None for each in middleware.PROFILE_VARIABLES
-    }
+    for chosen in middleware.PROFILE_VARIABLES:
+        monkeypatch.setenv(chosen, "/srv/own.xml")
+        middleware.configure()
+        middleware.clear_profile()
+        assert profiles() == {chosen: "/srv/own.xml"}
+        monkeypatch.delenv(chosen)
 
 
 @pytest.mark.ros
@@ -93,10 +101,10 @@ def test_discovery_on_this_machine_is_the_profiles(monkeypatch, variable, value)
     monkeypatch.setenv(middleware.LOCALHOST_VARIABLE, "0")
     monkeypatch.setenv(variable, value)
     middleware.configure()
-    assert os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"].endswith("/shared_memory_loopback.xml")
+    assert profiles()[VARIABLE].endswith(f"/shared_memory_loopback{ENDING}")
     assert not middleware.discovers_this_machine_only()
     middleware.configure(large_messages=False)  # as in a process that was started by this one
-    assert os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"].endswith("/udp_loopback.xml")
+    assert profiles()[VARIABLE].endswith(f"/udp_loopback{ENDING}")
     middleware.clear_profile()
     assert os.environ[middleware.RANGE_VARIABLE] == "LOCALHOST"
 
@@ -107,13 +115,14 @@ def test_discovery_on_this_machine_is_the_profiles(monkeypatch, variable, value)
 
 NODE = """
 import os, pathlib, sys
-from vinesim.ros import middleware
+from vinesim.ros import installation, middleware
 middleware.configure(large_messages=sys.argv[1] == "large")
 import rclpy
 rclpy.init()
 node = rclpy.create_node("some_node")
 maps = pathlib.Path("/proc/self/maps").read_text().split()
-segments = {path for path in maps if path.startswith(("/dev/shm/fastrtps_", "/dev/shm/fastdds_")) and "port" not in path}
+ours = ("/dev/shm/fastrtps_", "/dev/shm/fastdds_")
+segments = {path for path in maps if path.startswith(ours) and "port" not in path}
 print(sorted(os.path.getsize(path) for path in segments))
 """
 
@@ -149,12 +158,14 @@ def test_the_segment_holds_several_of_the_largest_messages(local):
 
 
 @pytest.mark.parametrize("local", [False, True])
-def test_the_profile_of_fast_dds_3_differs_from_that_of_2_in_names_only(local):
+@pytest.mark.parametrize("large", [False, True])
+def test_the_profile_of_fast_dds_3_adds_names_and_no_type_objects(large, local):
     two, three = (
-        middleware.profile_file(large_messages=False, local=local, version=version).read_text() for version in (2, 3)
+        middleware.profile_file(large_messages=large, local=local, version=version).read_text() for version in (2, 3)
     )
-    names = {"heartbeatPeriod": "heartbeat_period", "nackResponseDelay": "nack_response_delay"}
-    assert all(name in two for name in names)
-    for before, after in names.items():
+    for before, after in {"heartbeatPeriod": "heartbeat_period", "nackResponseDelay": "nack_response_delay"}.items():
+        assert large or before in two
         two = two.replace(before, after)
-    assert two == three
+    own = three[three.index("        <!-- Eclipse Cyclone") : three.index("      </rtps>")]
+    assert "<name>fastdds.type_propagation</name>" in own
+    assert three.replace(own, "") == two

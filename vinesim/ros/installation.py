@@ -63,6 +63,11 @@ def middlewares() -> list[str]:
     return sorted(names - {"rmw_implementation"})  # this one only loads another
 
 
+def fast_dds_version() -> int:
+    """Returns the major version of Fast DDS: 3 if its library has the name of version 3, else 2."""
+    return 3 if any(next(folder.glob("libfastdds.so*"), None) for folder in library_folders()) else 2
+
+
 def distribution() -> str:
     """Returns the name of the distribution, such as jazzy; ``"unknown"`` if nothing tells it."""
     if sourced_prefixes() or not is_of_wheels():

@@ -21,7 +21,8 @@ FOLDER = pathlib.Path(__file__).resolve().parent
 MIDDLEWARE_VARIABLE = "RMW_IMPLEMENTATION"
 """Environment variable with the name of the ROS middleware."""
 PROFILE_VARIABLES = {"FASTRTPS_DEFAULT_PROFILES_FILE": 2, "FASTDDS_DEFAULT_PROFILES_FILE": 3}
-"""Environment variables with the path of the Fast DDS profile, and the major version of Fast DDS that reads them."""
+"""Environment variables with the path of the Fast DDS profile, and the major version of Fast DDS that reads them. Kilted warns of the
+variable of version 2, so only one is set."""
 RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 """Environment variable with the discovery range of ROS 2."""
 LOCALHOST_VARIABLE = "ROS_LOCALHOST_ONLY"
@@ -85,8 +86,7 @@ def profile_file(*, large_messages: bool, local: bool, version: int = 2) -> path
     ``local``: whether all peers are on this machine. ``version``: major version of Fast DDS, 2 or 3. Version 3 refuses
     a file with the names of version 2."""
     kind = "shared_memory" if large_messages else "udp"
-    renamed = "" if large_messages or version == 2 else "_fast_dds_3"
-    return FOLDER / f"{kind}{'_loopback' if local else ''}{renamed}.xml"
+    return FOLDER / f"{kind}{'_loopback' if local else ''}{'_fast_dds_3' if version == 3 else ''}.xml"
 
 
 OWN_PROFILES = {
@@ -121,8 +121,9 @@ def configure(*, large_messages: bool | None = None) -> None:
         os.environ[RANGE_VARIABLE] = "SYSTEM_DEFAULT"
         os.environ.pop(LOCALHOST_VARIABLE, None)
         local = True
-    for variable, version in PROFILE_VARIABLES.items():
-        os.environ[variable] = str(profile_file(large_messages=large, local=local, version=version))
+    version = installation.fast_dds_version()
+    (variable,) = (name for name, reader in PROFILE_VARIABLES.items() if reader == version)
+    os.environ[variable] = str(profile_file(large_messages=large, local=local, version=version))
 
 
 def _profile() -> str:

@@ -187,9 +187,8 @@ class PackageBuild:
         """Write the header for symbol visibility of a generator. This is the only header that CMake creates instead
         of the generator."""
         name = f"{generator}__visibility_control.h"
-        text = (
-            (self.resources(generator) / f"{name}.in").read_text().replace("@PROJECT_NAME_UPPER@", self.package.upper())
-        )
+        text = (self.resources(generator) / f"{name}.in").read_text()
+        text = text.replace("@PROJECT_NAME_UPPER@", self.package.upper())
         header = self.output(generator) / "msg" / name
         header.parent.mkdir(exist_ok=True)
         header.write_text(text.replace("@PROJECT_NAME@", self.package))
