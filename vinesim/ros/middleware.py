@@ -21,8 +21,8 @@ FOLDER = pathlib.Path(__file__).resolve().parent
 MIDDLEWARE_VARIABLE = "RMW_IMPLEMENTATION"
 """Environment variable with the name of the ROS middleware."""
 PROFILE_VARIABLES = {"FASTRTPS_DEFAULT_PROFILES_FILE": 2, "FASTDDS_DEFAULT_PROFILES_FILE": 3}
-"""Environment variables with the path of the Fast DDS profile, and the major version of Fast DDS that reads them. Kilted warns of the
-variable of version 2, so only one is set."""
+"""Environment variables with the path of the Fast DDS profile, and the major version of Fast DDS that reads them.
+Kilted warns of the variable of version 2, so only one is set."""
 RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 """Environment variable with the discovery range of ROS 2."""
 LOCALHOST_VARIABLE = "ROS_LOCALHOST_ONLY"
