@@ -27,7 +27,7 @@ from vinesim.scene.plant_import.imported_plant import load_imported_plant
 from vinesim.scene.plant_import.ties import tie_to_wires
 from vinesim.scene.plant_import.wood import build_model, join_models
 from vinesim.scene.plant_parameters import VineParameters
-from vinesim.scene.spec import Scene, Sun, Wind
+from vinesim.scene.spec import Datum, Scene, Sun, Wind
 
 
 def generate(scene: Scene) -> Model:
@@ -45,7 +45,15 @@ def generate(scene: Scene) -> Model:
 
     # settings that no plant depends on must not change the digest
     plants = msgspec.structs.replace(
-        scene, name="", sun=Sun(), wind=Wind(), spawns=(), physics=PhysicsParameters(), plants="", imported=()
+        scene,
+        name="",
+        sun=Sun(),
+        wind=Wind(),
+        datum=Datum(),
+        spawns=(),
+        physics=PhysicsParameters(),
+        plants="",
+        imported=(),
     )
     imported = [(load_imported_plant(one.file), msgspec.structs.replace(one, file="")) for one in scene.imported]
     digest = disk_cache.source_digest(_code_digest(), msgspec.json.encode((plants, parameters, imported)))
