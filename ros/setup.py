@@ -8,7 +8,7 @@ from setuptools import setup
 PACKAGE = ElementTree.parse(Path(__file__).parent / "package.xml").getroot()
 NAME = PACKAGE.findtext("name", "")
 
-FOLDERS = ("control",)
+FOLDERS = ("control", "moveit", "nav2")
 """Folders with configuration of other packages."""
 
 
