@@ -217,6 +217,7 @@ def vinebot() -> str:
     for side, mirror in (("left", 1.0), ("right", -1.0)):
         arm(urdf, side, mirror)
         gripper(urdf, side, mirror)
+    hardware(urdf)
     return urdf.text()
 
 
@@ -522,6 +523,26 @@ def gripper(urdf: Urdf, side: str, mirror: float) -> None:
     cutter = (box((0.03, 0.06, 0.046), (-0.09, 0, -0.02), colour="dark"), *reach)
     urdf.link(f"{prefix}_cutter_link", cutter, mass=0.15)
     urdf.fix(f"{prefix}_cutter_link", f"{prefix}_base_link", (0.125, 0, 0.072))
+
+
+def hardware(urdf: Urdf) -> None:
+    """The robot as hardware of ros2_control: all interfaces of all joints, by the topics of vinesim."""
+    system = ElementTree.SubElement(urdf.root, "ros2_control", name="vinebot", type="system")
+    given = ElementTree.SubElement(system, "hardware")
+    ElementTree.SubElement(given, "plugin").text = "joint_state_topic_hardware_interface/JointStateTopicSystem"
+    parameters = {
+        "joint_commands_topic": "/robot_joint_commands",
+        "joint_states_topic": "/robot_joint_states",
+        "trigger_joint_command_threshold": "-1",  # a command in every cycle, also one that is reached
+    }
+    for name, value in parameters.items():
+        ElementTree.SubElement(given, "param", name=name).text = value
+    for joint in urdf.root.findall("joint"):
+        if joint.get("type") != "fixed":
+            commanded = ElementTree.SubElement(system, "joint", name=joint.get("name", ""))
+            for kind in ("command", "state"):
+                for quantity in ("position", "velocity", "effort"):
+                    ElementTree.SubElement(commanded, f"{kind}_interface", name=quantity)
 
 
 if __name__ == "__main__":

@@ -65,7 +65,6 @@ def test_an_error_is_the_exit_code_and_a_check_that_fails_is_one(capsys):
 
 def test_python_and_packages_of_other_versions():
     assert software.python((3, 10, 4)).state == ERROR
-    assert software.python((3, 14, 0)).state == ERROR
     assert "make a venv" in software.python((3, 10, 4)).remedy
     assert software.packages(["numpy>=2", 'nonsense-of-test>=1; extra == "voice"']).state == OK
     assert "voice" in software.packages(["numpy>=2", 'nonsense-of-test>=1; extra == "voice"']).found

@@ -85,8 +85,11 @@ def test_an_installation_has_all_files_and_is_in_the_ament_index(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     share = install(tmp_path, monkeypatch)
-    build = {"setup.py", "setup.cfg", "README.md"}
-    assert {path.name for path in share.iterdir()} == {p.name for p in FOLDER.iterdir() if p.is_file()} - build
+    build = {"setup.py", "setup.cfg", "README.md", "resource", "install", "__pycache__"}
+    assert {path.name for path in share.iterdir()} == {path.name for path in FOLDER.iterdir()} - build
+    for folder in filter(pathlib.Path.is_dir, share.iterdir()):
+        ours = {path.name for path in (FOLDER / folder.name).iterdir() if path.is_file()}
+        assert {path.name for path in folder.iterdir()} == ours
     if middleware.unavailable_reason() is None:
         packages = pytest.importorskip("ament_index_python.packages")
         monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))

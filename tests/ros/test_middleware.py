@@ -12,10 +12,20 @@ import xml.etree.ElementTree as ElementTree
 import pytest
 
 from tests.support.waiting import deadline
-from vinesim.ros import middleware
+from vinesim.ros import installation, middleware
 
 WHEELS = importlib.util.find_spec("ros_wheels_bootstrapper") is not None
 wheels_only = pytest.mark.skipif(not WHEELS, reason="ROS 2 is not installed as wheels: pip install 'vinesim[ros]'")
+VARIABLE, ENDING = {
+    2: ("FASTRTPS_DEFAULT_PROFILES_FILE", ".xml"),
+    3: ("FASTDDS_DEFAULT_PROFILES_FILE", "_fast_dds_3.xml"),
+}[installation.fast_dds_version()]
+"""Variable with the profile of the Fast DDS that is installed, and the end of the names of its profiles."""
+
+
+def profiles() -> dict[str, str]:
+    """The variables with profiles that are set."""
+    return {name: os.environ[name] for name in middleware.PROFILE_VARIABLES if name in os.environ}
 
 
 @pytest.mark.ros
@@ -38,7 +48,9 @@ def test_wheels_without_their_library_path_are_refused(monkeypatch):
 @wheels_only
 def test_a_middleware_that_the_wheels_lack_is_refused(monkeypatch):
     monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")
-    assert "RMW_IMPLEMENTATION is 'rmw_cyclonedds_cpp'" in str(middleware.unavailable_reason())
+    assert str(middleware.unavailable_reason()) == (
+        "RMW_IMPLEMENTATION is 'rmw_cyclonedds_cpp', but the ROS 2 wheels have only rmw_fastrtps_cpp; unset it"
+    )
 
 
 def test_without_ros_the_extra_is_named(monkeypatch):
@@ -49,30 +61,32 @@ def test_without_ros_the_extra_is_named(monkeypatch):
 
     monkeypatch.setattr(importlib, "import_module", missing)
     assert middleware.unavailable_reason() == (
-        "ROS 2 is missing (No module named 'rclpy.node'); pip install 'vinesim[ros]', "
-        "or source a ROS 2 Jazzy installation"
+        "ROS 2 is missing (No module named 'rclpy.node'); pip install 'vinesim[ros]', or source a ROS 2 installation"
     )
 
 
 @pytest.mark.ros
 @wheels_only
 def test_the_profile_is_set_unless_the_user_has_chosen(monkeypatch):
-    monkeypatch.delenv(middleware.PROFILE_VARIABLE, raising=False)
+    for each in middleware.PROFILE_VARIABLES:
+        monkeypatch.delenv(each, raising=False)
     monkeypatch.setenv(middleware.RANGE_VARIABLE, "SUBNET")
     middleware.configure()
-    assert os.environ[middleware.PROFILE_VARIABLE].endswith("/shared_memory.xml")
+    assert profiles()[VARIABLE].endswith(f"/shared_memory{ENDING}")
     assert os.environ[middleware.RANGE_VARIABLE] == "SUBNET"
     middleware.configure(large_messages=False)
     middleware.configure()  # as every node does
-    assert os.environ[middleware.PROFILE_VARIABLE].endswith("/udp.xml")
+    assert profiles()[VARIABLE].endswith(f"/udp{ENDING}")
     middleware.clear_profile()
-    assert middleware.PROFILE_VARIABLE not in os.environ
+    assert profiles() == {}
     assert os.environ[middleware.RANGE_VARIABLE] == "SUBNET"
 
-    monkeypatch.setenv(middleware.PROFILE_VARIABLE, "/srv/own.xml")
-    middleware.configure()
-    middleware.clear_profile()
-    assert os.environ[middleware.PROFILE_VARIABLE] == "/srv/own.xml"
+    for chosen in middleware.PROFILE_VARIABLES:
+        monkeypatch.setenv(chosen, "/srv/own.xml")
+        middleware.configure()
+        middleware.clear_profile()
+        assert profiles() == {chosen: "/srv/own.xml"}
+        monkeypatch.delenv(chosen)
 
 
 @pytest.mark.ros
@@ -81,15 +95,16 @@ def test_the_profile_is_set_unless_the_user_has_chosen(monkeypatch):
     ("variable", "value"), [(middleware.RANGE_VARIABLE, "LOCALHOST"), (middleware.LOCALHOST_VARIABLE, "1")]
 )
 def test_discovery_on_this_machine_is_the_profiles(monkeypatch, variable, value):
-    monkeypatch.delenv(middleware.PROFILE_VARIABLE, raising=False)
+    for each in middleware.PROFILE_VARIABLES:
+        monkeypatch.delenv(each, raising=False)
     monkeypatch.setenv(middleware.RANGE_VARIABLE, "SUBNET")
     monkeypatch.setenv(middleware.LOCALHOST_VARIABLE, "0")
     monkeypatch.setenv(variable, value)
     middleware.configure()
-    assert os.environ[middleware.PROFILE_VARIABLE].endswith("/shared_memory_loopback.xml")
+    assert profiles()[VARIABLE].endswith(f"/shared_memory_loopback{ENDING}")
     assert not middleware.discovers_this_machine_only()
     middleware.configure(large_messages=False)  # as in a process that was started by this one
-    assert os.environ[middleware.PROFILE_VARIABLE].endswith("/udp_loopback.xml")
+    assert profiles()[VARIABLE].endswith(f"/udp_loopback{ENDING}")
     middleware.clear_profile()
     assert os.environ[middleware.RANGE_VARIABLE] == "LOCALHOST"
 
@@ -100,13 +115,14 @@ def test_discovery_on_this_machine_is_the_profiles(monkeypatch, variable, value)
 
 NODE = """
 import os, pathlib, sys
-from vinesim.ros import middleware
+from vinesim.ros import installation, middleware
 middleware.configure(large_messages=sys.argv[1] == "large")
 import rclpy
 rclpy.init()
 node = rclpy.create_node("some_node")
 maps = pathlib.Path("/proc/self/maps").read_text().split()
-segments = {path for path in maps if path.startswith("/dev/shm/fastrtps_") and "port" not in path}
+ours = ("/dev/shm/fastrtps_", "/dev/shm/fastdds_")
+segments = {path for path in maps if path.startswith(ours) and "port" not in path}
 print(sorted(os.path.getsize(path) for path in segments))
 """
 
@@ -116,7 +132,7 @@ print(sorted(os.path.getsize(path) for path in segments))
 @pytest.mark.parametrize("reach", ["SUBNET", "LOCALHOST"])
 def test_only_nodes_with_pictures_use_shared_memory(reach):
     """Writing to the shared-memory queue of a stopped subscriber takes two seconds, so small topics go by UDP."""
-    environ = {name: value for name, value in os.environ.items() if name != middleware.PROFILE_VARIABLE}
+    environ = {name: value for name, value in os.environ.items() if name not in middleware.PROFILE_VARIABLES}
     environ |= {middleware.RANGE_VARIABLE: reach, "ROS_DOMAIN_ID": str(101 + os.getpid() % 100)}  # without peers
 
     def segments(kind: str) -> list[int]:
@@ -139,3 +155,17 @@ def test_the_segment_holds_several_of_the_largest_messages(local):
     organised_cloud = 640 * 480 * 16
     assert organised_cloud < message < segment
     assert segment >= 4 * organised_cloud
+
+
+@pytest.mark.parametrize("local", [False, True])
+@pytest.mark.parametrize("large", [False, True])
+def test_the_profile_of_fast_dds_3_adds_names_and_no_type_objects(large, local):
+    two, three = (
+        middleware.profile_file(large_messages=large, local=local, version=version).read_text() for version in (2, 3)
+    )
+    for before, after in {"heartbeatPeriod": "heartbeat_period", "nackResponseDelay": "nack_response_delay"}.items():
+        assert large or before in two
+        two = two.replace(before, after)
+    own = three[three.index("        <!-- Eclipse Cyclone") : three.index("      </rtps>")]
+    assert "<name>fastdds.type_propagation</name>" in own
+    assert three.replace(own, "") == two

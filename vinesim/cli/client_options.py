@@ -20,6 +20,8 @@ ROLES = ("robot", "human", "spectator")
 
 DEFAULT_WORLD = "vineyard"
 
+CONTROLLERS = ("own", "none")
+"""Whose controllers command a robot's joints: those of vinesim, or those of another controller manager."""
 STATUS_FORMATS = ("text", "json", "none")
 
 
@@ -100,6 +102,14 @@ class ClientOptions:
         typer.Option(help="Robots: a ROS 2 parameter file for the robot's nodes (YAML)."),
     ] = None
     ros: Annotated[bool, OF_ROBOT, typer.Option(help="Robots: run a ROS 2 node, if ROS 2 is installed.")] = True
+    controllers: Annotated[
+        str,
+        OF_ROBOT,
+        typer.Option(
+            help="Robots: own, or none: the robot is hardware of your controller_manager, by the topics "
+            "robot_joint_commands and robot_joint_states."
+        ),
+    ] = "own"
     push: Annotated[
         int | None,
         OF_ROBOT,
@@ -259,6 +269,8 @@ def check_options(options: ClientOptions) -> None:
             f"--real-time-factor {options.real_time_factor:g} with --connect: a world runs as fast as its server says; "
             "give it to vinesim server"
         )
+    if options.controllers not in CONTROLLERS:
+        raise UsageError(f"--controllers {options.controllers!r}: give {' or '.join(CONTROLLERS)}")
     if options.params_file is not None and not options.params_file.is_file():
         raise UsageError(f"--params-file {options.params_file}: there is no such file; give a ROS 2 parameter file")
     from vinesim.plants.device_buffers import find_device

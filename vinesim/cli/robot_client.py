@@ -18,6 +18,7 @@ from vinesim.client.tasks.planning import plan_task, validate_task_name
 from vinesim.client.tasks.start_poses import start_pose, validate_bunch
 from vinesim.core.errors import writing
 from vinesim.net.transport.bus import Bus
+from vinesim.robot.description.controllers import only_hardware
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.tasks.push import PushBunch
@@ -33,6 +34,8 @@ def run(options: ClientOptions) -> int:
         load_description(robot, srdf=options.srdf, xacro_args=options.xacro_args or ())
         for robot in options.robot or ["vinebot"]
     ]
+    if options.controllers == "none":
+        descriptions = [only_hardware(description) for description in descriptions]
     with ClientSession(options) as session:
         begin = start = None
         if options.job is not None:

@@ -110,6 +110,9 @@ class RobotNode(Node):
         self._foreign_types: dict[str, list[str]] = {}
         self._warned_topics: set[str] = set()
         names = [spec.name for spec in controllers]
+        names += [
+            topic for spec in controllers if spec.hardware for topic in (spec.hardware.commands, spec.hardware.states)
+        ]
         self._flow_control: FlowControl | None = None
         super().__init__(name, namespace, [*names, *imus, *wrenches], params_file, parameters)
 
@@ -132,7 +135,9 @@ class RobotNode(Node):
         numbers = {link.get("name", ""): number for number, link in enumerate(links)}
         self._contacts = ContactPublisher(self._advertise, self._bunch_of_body, numbers, self._interest_radius)
         self._actions = ControllerActions(self._node, self._controllers, self._commands)
-        self._subscriptions = CommandSubscriptions(self._node, self._controllers, self._commands, AudioData)
+        self._subscriptions = CommandSubscriptions(
+            self._node, self._controllers, self._commands, AudioData, _mimics(self._urdf)
+        )
 
         if middleware.asks_for_acknowledgements():
             self._flow_control = FlowControl()
@@ -333,3 +338,9 @@ class RobotNode(Node):
         for topic, build in messages:
             if topic.subscription_count or always:
                 topic.build_and_send(build)
+
+
+def _mimics(urdf: str) -> frozenset[str]:
+    """Returns the names of the joints of a URDF that follow other joints."""
+    joints = ElementTree.fromstring(urdf).iterfind("joint")
+    return frozenset(joint.get("name", "") for joint in joints if joint.find("mimic") is not None)

@@ -17,6 +17,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from vinesim.core.data_files import DataFileNotFound, find_data_file
+from vinesim.core.geodesy import APRILIA, Geodetic
 from vinesim.core.toml_loader import DataError, load_toml
 from vinesim.scene import plant_parameters
 from vinesim.scene.berries import VARIETIES
@@ -200,6 +201,22 @@ class Imported(_Part, frozen=True, kw_only=True):
     """[m] Largest gap at which a shoot is tied to a wire that it passes; 0: no ties."""
 
 
+class Datum(_Part, frozen=True, kw_only=True):
+    """Position of the world's origin on WGS 84, for GNSS receivers. x points to the east, y to the north."""
+
+    latitude: Annotated[float, msgspec.Meta(ge=-90.0, le=90.0)] = APRILIA.latitude
+    """[deg] Latitude, positive to the north."""
+    longitude: Annotated[float, msgspec.Meta(ge=-180.0, le=180.0)] = APRILIA.longitude
+    """[deg] Longitude, positive to the east."""
+    altitude: Annotated[float, msgspec.Meta(ge=-1e5, le=1e5)] = APRILIA.altitude
+    """[m] Height above the ellipsoid."""
+
+    @property
+    def place(self) -> Geodetic:
+        """The position as the functions of :mod:`vinesim.core.geodesy` take it."""
+        return Geodetic(self.latitude, self.longitude, self.altitude)
+
+
 class Scene(_Part, frozen=True, kw_only=True):
     """One vineyard as described by a scene file."""
 
@@ -218,6 +235,7 @@ class Scene(_Part, frozen=True, kw_only=True):
     imported: tuple[Imported, ...] = ()
     sun: Sun = Sun()
     wind: Wind = Wind()
+    datum: Datum = Datum()
     spawns: tuple[Spawn, ...] = ()
     physics: PhysicsParameters = PhysicsParameters()
     """Physics parameters. They are not part of the vineyard's digest."""

@@ -10,6 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import warp as wp
 
+from vinesim.core.geodesy import APRILIA, Geodetic
 from vinesim.kernels.raster import transform_primitives
 from vinesim.scene.values import SENSOR_KINDS, CameraOutput, RenderedMount, SensorFrame, Snapshot
 from vinesim.sensors.camera.sunlight import DEFAULT_SUN, SunPath
@@ -87,6 +88,8 @@ class SensorSetting:
     device: str = "cpu"
     threads: int | None = None
     """Number of CPU threads that render; None: the number of cores, at most four."""
+    datum: Geodetic = APRILIA
+    """Position of the world's origin on the Earth; x points to the east, y to the north."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -60,6 +60,8 @@ def packages(requirements: Iterable[str] | None = None) -> Finding:
     for extra, purpose in EXTRAS.items():
         parts = [one for one in wanted if one.marker is not None and one.marker.evaluate({"extra": extra})]
         parts = [one for one in parts if one not in needed]
+        if extra == "ros" and importlib.util.find_spec("rclpy") is not None:
+            continue  # of another distribution, or sourced: the check of ROS tells which
         if any(_fault(one) for one in parts):
             states.append(f"{extra} ({purpose})")
     found = f"all {len(needed)} that are needed" + (f"; not complete: {', '.join(states)}" if states else "")
@@ -81,7 +83,7 @@ def _fault(wanted) -> str:  # the type is packaging.requirements.Requirement
 
 def ros() -> Finding:
     """Check whether this process can use ROS 2, and with which message packages."""
-    from vinesim.ros import middleware
+    from vinesim.ros import installation, middleware
 
     if (reason := middleware.unavailable_reason()) is not None:
         reason, _, remedy = reason.rpartition("; ")
@@ -90,7 +92,8 @@ def ros() -> Finding:
 
     missing = messages.unbuilt_packages()
     domain = os.environ.get("ROS_DOMAIN_ID", "0")
-    found = f"{middleware.WHEEL_MIDDLEWARE if _wheels() else os.environ.get('ROS_DISTRO', '?')}, domain {domain}"
+    kind = "wheels" if installation.is_of_wheels() else "installation"
+    found = f"{installation.distribution()}, {kind} in {installation.place()}, {middleware.name()}, domain {domain}"
     if not missing:
         return Finding("ros", OK, f"{found}, all message packages")
     return Finding(
@@ -99,10 +102,6 @@ def ros() -> Finding:
         f"{found}, without messages of {', '.join(missing)}",
         "vinesim ros build-interfaces (needs g++); a client does so at its first start",
     )
-
-
-def _wheels() -> bool:
-    return importlib.util.find_spec("ros_wheels_bootstrapper") is not None
 
 
 def page() -> Finding:

@@ -89,7 +89,8 @@ class RosConfig:
         """Topics that need the records of steps, or prefixes of several such topics. The first is /clock."""
         states = [one.name for one in self.controllers if one.kind is ControllerKind.JOINT_TRAJECTORY]
         elastic = [one.name for one in self.controllers if one.kind is ControllerKind.SERIES_ELASTIC]
-        return ("/clock", *STATE_TOPICS, *self.imus, *self.wrenches, *states, *elastic)
+        hardware = [one.hardware.states for one in self.controllers if one.hardware is not None]
+        return ("/clock", *STATE_TOPICS, *self.imus, *self.wrenches, *states, *elastic, *hardware)
 
 
 class RosChannel:

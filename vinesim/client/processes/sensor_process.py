@@ -111,6 +111,7 @@ class SensorProcess:
             device,
             pacing=pacing or description.sensor_pacing,
             wind=wind_of(scene),
+            datum=scene.datum.place,
             params_file=params_file,
         )
         self._pacing = config.pacing

@@ -23,6 +23,7 @@ from vinesim.client.processes.shared_memory import SharedArrays, SharedSnapshot
 from vinesim.client.processes.worker import POLL_PERIOD, Worker, report_ready, serve
 from vinesim.client.world_time import OffsetHistory
 from vinesim.core import allocator, frames, progress
+from vinesim.core.geodesy import APRILIA, Geodetic
 from vinesim.kernels.compilation import SENSOR_PACKAGES, compile_kernels
 from vinesim.plants.device_buffers import device_fault
 from vinesim.robot.description.description import RobotDescription
@@ -96,6 +97,8 @@ class SensorConfig:
     pacing: SensorPacing = LIVE
     wind: Wind | None = None
     """Wind of the scene."""
+    datum: Geodetic = APRILIA
+    """Position of the world's origin on the Earth."""
     params_file: pathlib.Path | None = None
     """File with ROS parameters of the node."""
     parameters: dict[str, Any] = dataclasses.field(default_factory=dict)
@@ -313,7 +316,7 @@ class SensorWorker(Worker):
         if device == "cpu":
             load_kernels(*{mount.kind: None for mount in config.description.sensors})
         seed = zlib.crc32(config.name.encode())  # no two robots have the same noise
-        setting = SensorSetting(config.sun, seed, device=device)
+        setting = SensorSetting(config.sun, seed, device=device, datum=config.datum)
         sensors = [
             ScheduledSensor(
                 maker(mount.kind).make(mount, setting),

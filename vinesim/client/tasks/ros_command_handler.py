@@ -22,6 +22,7 @@ from vinesim.ros.commands.types import (
     GoalResult,
     GoalStatus,
     GripperGoal,
+    HardwareCommand,
     ImpedanceCommand,
     JointTolerances,
     JointTrajectory,
@@ -116,6 +117,9 @@ class RosCommandHandler:
                 self.robot.command_base(float(command.linear[0]), float(command.angular[2]), time)
             case ForwardCommand():
                 controllers.forward(command.controller, command.values)
+            case HardwareCommand():
+                values = command.position, command.velocity, command.effort
+                controllers.command_hardware(command.controller, command.joints, *values, time)
             case ImpedanceCommand():
                 controllers.command_impedance(command.controller, command.what, command.values)
             case ElasticCommand():

@@ -7,7 +7,7 @@ gives the goal an id. :meth:`ControllerManager.take_results` returns the results
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -67,6 +67,9 @@ class ControllerManager:
         """Active goal of each controller, by name of the controller."""
         self._results: list[GoalResult] = []
         self._gains: dict[str, dict[str, np.ndarray]] = {}
+        self._ends = np.full(len(joints), np.inf)
+        """[joint] Time at which a velocity or an effort of another controller manager ends [s]; infinite if the
+        joint has none."""
 
     # ------------------------------------------------------------------ goals
 
@@ -159,6 +162,45 @@ class ControllerManager:
             raise CommandError(f"{self.robot.name} has no forward controller {name!r}")
         self._pass_on(spec, values, commands[spec.kind])
 
+    def command_hardware(
+        self,
+        name: str,
+        joints: Sequence[str],
+        position: np.ndarray,
+        velocity: np.ndarray,
+        effort: np.ndarray,
+        time: float,
+    ) -> None:
+        """Command ``joints`` [k] of a controller of the kind ``topic_based`` at ``time`` [s]. NaN: no command. A joint
+        with several commands obeys its position, else its velocity.
+
+        Velocities and efforts end after the controller's timeout; then the joint stops. Positions are held.
+        """
+        spec = self._spec(name, ControllerKind.TOPIC_BASED)
+        if foreign := [joint for joint in joints if joint not in spec.joints]:
+            raise CommandError(f"{name} of {self.robot.name} does not move {', '.join(foreign)}")
+        indices = self.robot.joint_indices(joints)
+        free = np.ones(len(indices), bool)
+        end = time + (np.inf if spec.hardware is None else spec.hardware.timeout)
+        for values, command, until in (
+            (position, self.robot.command_position, np.inf),
+            (velocity, self.robot.command_velocity, end),
+            (effort, self.robot.command_effort, end),
+        ):
+            given = free & ~np.isnan(values)
+            free &= ~given
+            if given.any():
+                command(values[given], indices[given])
+                self._ends[indices[given]] = until
+        self._claim(name, indices[~free])
+
+    def _end_commands(self, time: float) -> None:
+        """Stop the joints whose last velocity or effort from another controller manager is too old."""
+        late = np.flatnonzero(time > self._ends)
+        if len(late):
+            self._ends[late] = np.inf
+            self.robot.command_velocity(np.zeros(len(late)), late)
+
     def command_impedance(self, name: str, what: str, values: np.ndarray) -> None:
         """Set the stiffness or damping of an impedance controller's joints, or move its equilibrium. ``what``:
         "stiffness", "damping" or "equilibrium". ``values`` [joint]."""
@@ -191,6 +233,7 @@ class ControllerManager:
 
     def __call__(self, time: float) -> None:
         """Command the set-points of the step that starts at ``time`` [s]. Call this before :meth:`Robot.control`."""
+        self._end_commands(time)
         for name, controller in self._trajectories.items():
             active = self._goals.get(name)
             if controller.is_moving:
@@ -240,6 +283,8 @@ class ControllerManager:
             self._end(other, Outcome.PREEMPTED, f"{name} took over joints of {other}")
         for j in joints:
             self._owner[j] = name
+        if self.specs[name].hardware is None:
+            self._ends[joints] = np.inf
         self._follows[joints] = name in self._trajectories
 
     def _end(self, name: str, outcome: Outcome, text: str, time: float = 0.0) -> None:

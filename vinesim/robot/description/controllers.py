@@ -7,15 +7,17 @@ If the URDF has ``ros2_control`` tags, a controller commands only joints that ha
 from __future__ import annotations
 
 import dataclasses
+import math
 import pathlib
 from collections.abc import Container, Mapping, Sequence
 
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
+from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.grippers import GRIPPER_KINDS
 from vinesim.robot.description.sidecar import Controller, Sidecar
 from vinesim.robot.description.urdf import description_error
-from vinesim.scene.values import FORWARD_KINDS, ControllerKind, ControllerSpec
+from vinesim.scene.values import FORWARD_KINDS, ControllerKind, ControllerSpec, HardwareTopics
 
 INTERFACE_OF_KIND = {
     ControllerKind.JOINT_TRAJECTORY: "position",
@@ -26,6 +28,8 @@ INTERFACE_OF_KIND = {
     ControllerKind.IMPEDANCE: "effort",
 }
 """Command interface of ros2_control that a joint must have for each kind of controller."""
+HARDWARE_KEYS = ("commands", "states", "timeout")
+"""Keys that only a controller of the kind ``topic_based`` has in a TOML file."""
 FINGERS_CONTROLLER = "gripper"
 """Alternative to ``fingers`` as the ``kind`` of a controller in a TOML file."""
 MIN_ARM_JOINTS = 4
@@ -102,7 +106,35 @@ def _checked(
         raise description_error(file, f"controller {name!r} moves {list(joints)}", "name joints, each once")
     if gripper in GRIPPER_KINDS:
         return ControllerSpec(name, ControllerKind.GRIPPER, joints, given.group, gripper)
-    return ControllerSpec(name, ControllerKind(given.kind), joints, given.group)
+    hardware = _hardware(name, given, file)
+    return ControllerSpec(name, ControllerKind(given.kind), joints, given.group, hardware=hardware)
+
+
+def _hardware(name: str, given: Controller, file: pathlib.Path) -> HardwareTopics | None:
+    """Returns the topics of a controller of the kind ``topic_based``; None for other kinds. Raises
+    :class:`DescriptionError` for an invalid timeout, or topics that the controller's kind does not have."""
+    keys = {key: value for key in HARDWARE_KEYS if (value := getattr(given, key)) is not None}
+    if given.kind != ControllerKind.TOPIC_BASED:
+        if keys:
+            found = f"controller {name!r} of the kind {given.kind!r} has {', '.join(keys)}"
+            raise description_error(file, found, f"these keys belong to the kind {ControllerKind.TOPIC_BASED}")
+        return None
+    if not 0.0 < keys.get("timeout", 1.0) < math.inf:
+        raise description_error(file, f"controller {name!r} has the timeout {given.timeout}", "give more than 0 s")
+    return HardwareTopics(**keys)
+
+
+def only_hardware(description: RobotDescription) -> RobotDescription:
+    """Returns the robot without controllers of joints: another controller manager commands its joints.
+
+    Controllers of the kind ``topic_based`` stay. If there is none, one is made for all driven joints. Grippers without
+    joints, such as cutters, stay, because no joint would operate them.
+    """
+    kept = [spec for spec in description.controllers if spec.hardware is not None or not spec.joints]
+    if all(spec.hardware is None for spec in kept):
+        joints = tuple(drive.joint for drive in description.drives)
+        kept.append(ControllerSpec("hardware", ControllerKind.TOPIC_BASED, joints, hardware=HardwareTopics()))
+    return dataclasses.replace(description, controllers=tuple(sorted(kept, key=lambda spec: spec.name)))
 
 
 def _of_gripper(name: str, kind: str, group: str, sidecar: Sidecar) -> ControllerSpec:

@@ -90,6 +90,10 @@ class Controller(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Names of the controller's joints. If empty, the joints of ``group``."""
     group: str = ""
     """Name of a joint group. It is required for a gripper."""
+    commands: str | None = None
+    states: str | None = None
+    timeout: float | None = None
+    """Topics of the kind ``topic_based``, and its timeout [s]: see :class:`~vinesim.scene.values.HardwareTopics`."""
 
 
 class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -3,7 +3,7 @@ messages."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from vinesim.ros.commands.types import (
     ElasticCommand,
     ForwardCommand,
     GripperGoal,
+    HardwareCommand,
     ImpedanceCommand,
     JointTolerances,
     JointTrajectory,
@@ -106,6 +107,31 @@ def elastic_command(message: JointState, controller: str, joint: str) -> Elastic
     if place >= len(positions) or (names and joint not in names) or not np.isfinite(positions[place]):
         raise CommandError(f"{controller}/{joint}: positions {positions} of {names}; give a finite position of {joint}")
     return ElasticCommand(controller, joint, positions[place])
+
+
+def hardware_command(
+    message: JointState, controller: str, joints: Sequence[str], mimics: Container[str]
+) -> HardwareCommand:
+    """Convert commands for some of ``joints``. Each of position, velocity and effort is empty, or has one value for
+    each name, NaN for none. Names in ``mimics``, of joints that follow others, are left out."""
+    names = list(message.name)
+    unknown = [name for name in names if name not in joints and name not in mimics]
+    if unknown or len(set(names)) < len(names):
+        found = f"commands for {', '.join(unknown) or 'a joint twice'}"
+        raise CommandError(f"{controller}: {found}; name each joint once, among {', '.join(joints)}")
+    kept = [place for place, name in enumerate(names) if name in joints]
+    parts = {}
+    for part in ("position", "velocity", "effort"):
+        values = np.array(getattr(message, part), float)
+        if len(values) not in (0, len(names)):
+            raise CommandError(
+                f"{controller}: {len(values)} values of {part} for {len(names)} joints; give one each, NaN for none "
+                "(joint_state_topic_hardware_interface does so)"
+            )
+        if np.isinf(values).any():
+            raise CommandError(f"{controller}: values of {part} are not finite: {values.tolist()}")
+        parts[part] = values[kept] if len(values) else np.full(len(kept), np.nan)
+    return HardwareCommand(controller, tuple(names[place] for place in kept), **parts)
 
 
 def joint_trajectory(

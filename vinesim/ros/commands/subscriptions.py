@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from functools import partial
 from typing import Any
 
@@ -21,6 +21,7 @@ from vinesim.ros.commands.types import (
     Command,
     ElasticCommand,
     ForwardCommand,
+    HardwareCommand,
     ImpedanceCommand,
     LightsColor,
     LightsPattern,
@@ -91,6 +92,8 @@ def _setpoint_key(command: Command) -> tuple[str, ...] | None:
             return (command.controller,)
         case ImpedanceCommand():
             return (command.controller, command.what)
+        case HardwareCommand():
+            return (command.controller, *command.joints)
         case ElasticCommand():
             return (command.controller, command.joint)
     return None
@@ -98,12 +101,18 @@ def _setpoint_key(command: Command) -> tuple[str, ...] | None:
 
 class CommandSubscriptions:
     """Subscriptions to the command topics of the base, lights, loudspeaker and ``controllers`` of a robot.
-    ``audio_data``: message type of sound."""
+    ``audio_data``: message type of sound. ``mimics``: names of joints that follow others."""
 
     def __init__(
-        self, node: rclpy.node.Node, controllers: Sequence[ControllerSpec], queue: CommandQueue, audio_data: type
+        self,
+        node: rclpy.node.Node,
+        controllers: Sequence[ControllerSpec],
+        queue: CommandQueue,
+        audio_data: type,
+        mimics: Container[str] = (),
     ) -> None:
         self._node = node
+        self._mimics = mimics
         self._queue = queue
         self.types: dict[str, str] = {}
         """Accepted message type (``package/msg/Name``) by full name of the topic."""
@@ -113,7 +122,11 @@ class CommandSubscriptions:
         self._subscribe(Bool, "indicator_lights/sound", lambda message: LightsSound(message.data))
         self._subscribe(audio_data, "speaker/audio", convert.loudspeaker_sound)
         for spec in controllers:
-            self._subscribe_controller(spec.name, spec.kind, spec.joints)
+            if spec.hardware is None:
+                self._subscribe_controller(spec.name, spec.kind, spec.joints)
+            else:
+                take = partial(convert.hardware_command, controller=spec.name, joints=spec.joints, mimics=self._mimics)
+                self._subscribe(JointState, spec.hardware.commands, take)
 
     def _subscribe_controller(self, name: str, kind: ControllerKind, joints: tuple[str, ...]) -> None:
         if kind is ControllerKind.JOINT_TRAJECTORY:

@@ -36,6 +36,21 @@ class ForwardCommand:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
+class HardwareCommand:
+    """Commands of another controller manager for some joints (sensor_msgs/JointState). NaN: no command. A joint with
+    several commands obeys its position, else its velocity."""
+
+    controller: str
+    joints: tuple[str, ...]
+    position: np.ndarray
+    """[joint] Positions [rad or m], NaN for none."""
+    velocity: np.ndarray
+    """[joint] Velocities [rad/s or m/s], NaN for none."""
+    effort: np.ndarray
+    """[joint] Efforts [N m or N], NaN for none."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
 class ImpedanceCommand:
     """Gains or equilibrium of all joints of an impedance controller (std_msgs/Float64MultiArray)."""
 
@@ -144,6 +159,7 @@ class CancelGoal:
 Command = (
     BaseVelocity
     | ForwardCommand
+    | HardwareCommand
     | ImpedanceCommand
     | ElasticCommand
     | JointTrajectory

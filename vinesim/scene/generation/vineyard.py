@@ -34,7 +34,7 @@ from vinesim.scene.plant_import.imported_plant import load_imported_plant
 from vinesim.scene.plant_import.ties import tie_to_wires
 from vinesim.scene.plant_import.wood import build_model, join_models
 from vinesim.scene.plant_parameters import VineParameters
-from vinesim.scene.spec import Scene, Sun, Wind
+from vinesim.scene.spec import Datum, Scene, Sun, Wind
 from vinesim.scene.terrain import Terrain, ground_height
 
 
@@ -54,7 +54,15 @@ def generate(scene: Scene) -> Model:
 
     # settings that no plant depends on must not change the digest
     plants = msgspec.structs.replace(
-        scene, name="", sun=Sun(), wind=Wind(), spawns=(), physics=PhysicsParameters(), plants="", imported=()
+        scene,
+        name="",
+        sun=Sun(),
+        wind=Wind(),
+        datum=Datum(),
+        spawns=(),
+        physics=PhysicsParameters(),
+        plants="",
+        imported=(),
     )
     if terrain is not None:  # the path of an image must not change the digest, but its content must
         plants = msgspec.structs.replace(plants, terrain=None)

@@ -79,10 +79,25 @@ class ControllerKind(enum.StrEnum):
     FORWARD_EFFORT = "forward_effort"
     IMPEDANCE = "impedance"
     SERIES_ELASTIC = "series_elastic"
+    TOPIC_BASED = "topic_based"
+    """No controller of vinesim: the joints are hardware of another controller manager, by two topics."""
 
 
 FORWARD_KINDS = (ControllerKind.FORWARD_POSITION, ControllerKind.FORWARD_VELOCITY, ControllerKind.FORWARD_EFFORT)
 """Kinds of controllers that send the command for each joint unchanged to its drive."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class HardwareTopics:
+    """Topics by which joints are the hardware of another controller manager, with the default names of
+    ``topic_based_ros2_control`` and ``joint_state_topic_hardware_interface``."""
+
+    commands: str = "robot_joint_commands"
+    """Topic of the commands (sensor_msgs/JointState), relative to the robot's namespace."""
+    states: str = "robot_joint_states"
+    """Topic of the states (sensor_msgs/JointState), relative to the robot's namespace."""
+    timeout: float = 0.5
+    """Time after the last command at which a joint with a velocity or an effort stops [s]. Positions are held."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -97,6 +112,8 @@ class ControllerSpec:
     """Name of the joint group of the gripper; empty if the controller does not control a gripper."""
     gripper: str = ""
     """Kind of the gripper, see :mod:`vinesim.robot.description.grippers`; empty for other controllers."""
+    hardware: HardwareTopics | None = None
+    """Topics of a controller of the kind ``topic_based``; None for other controllers."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -383,6 +383,69 @@ class MultispectralFrame:
         return np.divide(nir - red, total, out=np.zeros_like(total), where=total > 0.0)
 
 
+class FixKind(enum.StrEnum):
+    """Kinds of fixes of a GNSS receiver."""
+
+    NONE = "none"
+    SINGLE = "single"
+    """Without corrections."""
+    FLOAT = "float"
+    """With corrections of a base station; ambiguities of the carrier phases are not whole numbers yet."""
+    FIXED = "fixed"
+    """With corrections of a base station and whole ambiguities."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class GnssFix:
+    """One position of a GNSS receiver on WGS 84."""
+
+    time: float
+    name: str
+    frame_id: str
+    """Link of the antenna."""
+    kind: FixKind
+    latitude: float
+    """Latitude [deg]; NaN without a fix."""
+    longitude: float
+    """Longitude [deg]; NaN without a fix."""
+    altitude: float
+    """Height above the ellipsoid [m]; NaN without a fix."""
+    variance: np.ndarray
+    """[3] m2, variances of east, north and up; 0 for an exact position."""
+
+    @property
+    def measured(self) -> tuple[np.ndarray, ...]:
+        """Returns the measured numbers; see :attr:`SensorFrame.measured`."""
+        return (np.array([self.latitude, self.longitude, self.altitude]),)
+
+
+class GnssMount(RenderedMount, frozen=True, forbid_unknown_fields=True):
+    """A GNSS receiver on a robot; ``frame`` is the link of its antenna."""
+
+    kind: ClassVar[str] = "gnss"
+    fix: Literal["single", "float", "fixed"] = "fixed"
+    """Kind of fix, except in and after an outage."""
+    datum: tuple[float, float, float] | None = None
+    """Latitude [deg], longitude [deg] and height above the ellipsoid [m] of the world's origin; by default the scene's
+    datum."""
+    outage_rate: float = 0.0
+    """Mean number of outages in an hour."""
+    outage_duration: float = 10.0
+    """Duration of an outage [s]."""
+
+    def fault(self) -> tuple[str, str] | None:
+        """Returns the name of an invalid field and how to correct it; None if all values are valid."""
+        if self.datum is not None:
+            latitude, longitude, altitude = self.datum
+            if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0 and abs(altitude) <= 1e5):
+                return f"the datum {list(self.datum)}", "give latitude and longitude in degrees, and altitude in m"
+        if not 0.0 <= self.outage_rate <= 1000.0:
+            return f"the outage_rate {self.outage_rate}", "give 0 to 1000 an hour"
+        if not 0.0 < self.outage_duration <= 1800.0:
+            return f"the outage_duration {self.outage_duration}", "give more than 0 and at most 1800 s"
+        return super().fault()
+
+
 class CameraMount(PictureMount, frozen=True, forbid_unknown_fields=True):
     """An RGB-D camera on a robot. ``quality``: quality of its live pictures, see
     :data:`vinesim.sensors.camera.camera.QUALITIES`."""
@@ -493,6 +556,14 @@ SENSOR_KINDS: dict[str, SensorKind] = {
         publisher="vinesim.ros.publishers.multispectral",
         whole=CameraOutput.RGB,
         topics=("ndvi/image_raw", "ndvi/camera_info"),
+    ),
+    GnssMount.kind: SensorKind(
+        table="gnss",
+        mount=GnssMount,
+        maker="vinesim.sensors.gnss",
+        publisher="vinesim.ros.publishers.gnss",
+        whole=CameraOutput.RGB,
+        topics=("fix",),
     ),
 }
 """All kinds of sensors, by name. A robot's sensors are listed in this order; sensors of one kind in the order of the
