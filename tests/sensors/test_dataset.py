@@ -19,16 +19,19 @@ import numpy as np
 import pytest
 from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
+from pycocotools.cocoeval import COCOeval
 
 from tests.support import programs
 from tests.support.waiting import deadline
 from vinesim.cli.dataset import _progress
+from vinesim.cli.dataset import run as run_dataset
 from vinesim.cli.render import run as render
 from vinesim.client.composition.domain_randomizer import SceneRandomizer
 from vinesim.client.composition.scene_composer import PlacementError
 from vinesim.core import progress
 from vinesim.core.data_files import DataFileNotFound
 from vinesim.core.errors import UsageError, WriteError
+from vinesim.core.version import __version__
 from vinesim.robot.description.urdf import DescriptionError
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.spec import load_scene
@@ -163,12 +166,114 @@ def test_pycocotools_reads_it(whole: pathlib.Path, capsys: pytest.CaptureFixture
         mask = read.annToMask(one).astype(bool)
         assert np.array_equal(mask, ids == label(Organ.BUNCH, one["bunch"]))
         assert one["area"] == mask.sum() >= annotations.MIN_ANNOTATED_PIXELS
-        assert one["bbox"] == coco_mask.toBbox(one["segmentation"]).tolist()
+        assert one["bbox"] == coco_mask.toBbox(read.annToRLE(one)).tolist()
         amodal = coco_mask.decode(one["amodal_segmentation"]).astype(bool)
         assert not (mask & ~amodal).any()
         assert one["occlusion"] == pytest.approx(1.0 - mask.sum() / amodal.sum())
         assert one["amodal_bbox"] == coco_mask.toBbox(one["amodal_segmentation"]).tolist()
         assert len(one["keypoints"]) == 3 * len(read.cats[one["category_id"]]["keypoints"])
+
+
+def test_coco_evaluation_of_the_truth_itself_finds_all(whole: pathlib.Path) -> None:
+    truth = COCO(str(whole / "annotations.json"))
+    names = ("image_id", "category_id", "bbox", "segmentation")
+    found = truth.loadRes([{name: one[name] for name in names} | {"score": 0.9} for one in truth.anns.values()])
+    for kind in ("bbox", "segm"):
+        judge = COCOeval(truth, found, kind)
+        judge.evaluate()
+        judge.accumulate()
+        judge.summarize()
+        assert judge.stats[0] == pytest.approx(1.0)
+
+
+@pytest.fixture
+def copy(whole: pathlib.Path, tmp_path: pathlib.Path) -> pathlib.Path:
+    """A copy of the data set, to be changed."""
+    shutil.copytree(whole, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+@pytest.mark.parametrize("form", annotations.SEGMENTATIONS)
+def test_masks_in_every_form_are_those_of_the_ids(copy: pathlib.Path, form: str) -> None:
+    """By the calls of torchvision's references and of DETR, which do not take compressed run lengths."""
+    dataset.finish(copy, IMAGES, form)
+    said = json.loads((copy / "annotations.json").read_text())
+    shapes = {one["id"]: (one["height"], one["width"]) for one in said["images"]}
+    for one in said["annotations"]:
+        mask = one["segmentation"]
+        if form != "compressed":
+            mask = coco_mask.frPyObjects(mask, *shapes[one["image_id"]])
+        pixels = coco_mask.decode(mask)
+        pixels = pixels.any(axis=2) if pixels.ndim == 3 else pixels.astype(bool)
+        ids = _ids(copy / "ids" / f"{one['image_id']:06d}.png")
+        assert np.array_equal(pixels, ids == label(Organ.BUNCH, one["bunch"]))
+
+
+def test_coco_file_names_version_seed_and_licence_but_no_date(whole: pathlib.Path, copy: pathlib.Path) -> None:
+    said = json.loads((copy / "annotations.json").read_text())
+    assert said["info"]["version"] == __version__
+    assert said["info"]["seed"] == 5
+    assert not {"year", "date_created"} & said["info"].keys()
+    assert {one["license"] for one in said["images"]} == {one["id"] for one in said["licenses"]}
+    assert all(one["supercategory"] for one in said["categories"])
+    dataset.finish(copy, IMAGES)
+    assert _files(copy) == _files(whole)
+
+
+def test_yolo_segments_are_the_masks(copy: pathlib.Path) -> None:
+    dataset.finish(copy, IMAGES, yolo="segment")
+    for record in (json.loads(p.read_text()) for p in sorted((copy / "records").glob("*.json"))):
+        ids = _ids(copy / "ids" / f"{record['image']:06d}.png")
+        lines = (copy / "labels" / f"{record['image']:06d}.txt").read_text().splitlines()
+        large = [b for b in record["bunches"] if b["pixels"] >= annotations.MIN_ANNOTATED_PIXELS]
+        for line, one in zip(lines, large, strict=True):
+            words = line.split()
+            assert words[0] == "0"
+            shares = np.array(words[1:], float)
+            assert len(shares) % 2 == 0
+            assert len(shares) >= 6
+            assert ((shares >= 0.0) & (shares <= 1.0)).all()
+            polygon = shares.reshape(-1, 2) * [160, 120]
+            assert np.abs(polygon - polygon.round()).max() < 1e-3  # corners of pixels
+            pixels = coco_mask.decode(coco_mask.frPyObjects([polygon.ravel().tolist()], 120, 160))[..., 0]
+            assert np.array_equal(pixels.astype(bool), ids == one["label"])
+            low, high = polygon.min(0), polygon.max(0)  # Ultralytics makes the box of a segment so
+            assert [*low, *(high - low)] == pytest.approx(one["box"], abs=1e-3)
+
+
+def test_yolo_poses_are_boxes_and_cut_points(whole: pathlib.Path, copy: pathlib.Path) -> None:
+    dataset.finish(copy, IMAGES, yolo="pose")
+    settings = (copy / "data.yaml").read_text()
+    assert "kpt_shape: [1, 3]\n" in settings
+    assert "flip_idx: [0]\n" in settings
+    shown = set()
+    annotated = json.loads((copy / "annotations.json").read_text())["annotations"]
+    for image in range(IMAGES):
+        lines = (copy / "labels" / f"{image:06d}.txt").read_text().splitlines()
+        boxes = (whole / "labels" / f"{image:06d}.txt").read_text().splitlines()
+        points = [one["keypoints"] for one in annotated if one["image_id"] == image]
+        for line, box, (column, row, seen) in zip(lines, boxes, points, strict=True):
+            words = line.split()
+            assert words[:5] == box.split()
+            assert len(words) == 8
+            values = np.array(words[1:7], float)
+            assert ((values >= 0.0) & (values <= 1.0)).all()
+            assert int(words[7]) == seen
+            if seen:  # a middle of a pixel is at half a pixel in shares
+                assert values[4:] * [160, 120] == pytest.approx([column + 0.5, row + 0.5], abs=1e-3)
+            else:
+                assert not values[4:].any()
+            shown.add(seen)
+    assert len(shown) > 1
+
+
+def test_unknown_forms_are_refused_in_one_line(scene: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    given = {"images": 1, "out": tmp_path / "set", "scene": str(scene), "seed": 5, "camera": "d435", "size": None}
+    given |= {"workers": 1, "actors": 0.0, "device": "cpu"}
+    for option, words in (("segmentation", "polygons, rle or compressed"), ("yolo", "detect, segment or pose")):
+        with pytest.raises(UsageError, match=f"--{option} is 'coco': give {words}"):
+            run_dataset(**given, **{option: "coco"})
+    assert not (tmp_path / "set").exists()
 
 
 def _ids(file: pathlib.Path) -> np.ndarray:
@@ -243,7 +348,7 @@ def test_an_image_is_the_same_whatever_was_drawn_before(
     last = dataset.IMAGES_PER_VINEYARD - 1
     list(dataset.render_images(plan, tmp_path, [last]))
     alone = {name: data for name, data in _files(tmp_path).items() if f"{last:06d}" in name}
-    assert len(alone) == 7
+    assert len(alone) == 6
     assert alone == {name: _files(whole)[name] for name in alone}
 
 
@@ -316,16 +421,16 @@ def test_a_failing_disk_leaves_the_image_before_whole_and_the_same_command_goes_
     (out / "images" / "000001.png").unlink()
     before = _files(out)
     with pytest.MonkeyPatch.context() as patch:
-        _full_disk(patch, "000001.txt", error)
+        _full_disk(patch, "000001.json", error)
         with pytest.raises(WriteError, match=f"image 1 .*{os.strerror(error)}; make room .* goes on") as said:
             list(dataset.render_images(plan, out, dataset.missing_images(out, IMAGES)))
     assert "\n" not in str(said.value)
     assert said.value.exit_code == 5
     assert _files(out) == before
-    for name in ("annotations.json", "val.txt", "data.yaml"):
+    for name in ("annotations.json", "000001.txt", "val.txt", "data.yaml"):
         with pytest.MonkeyPatch.context() as patch:
             _full_disk(patch, name, error)
-            with pytest.raises(WriteError, match=r"annotations\.json and the lists"):
+            with pytest.raises(WriteError, match=r"annotations\.json, the labels and the lists"):
                 dataset.finish(out, IMAGES)
         assert _files(out) == before
     assert list(dataset.render_images(plan, out, dataset.missing_images(out, IMAGES))) == [1]
@@ -359,7 +464,7 @@ def _empty(file: pathlib.Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [_truncate, _empty, pathlib.Path.unlink])
-@pytest.mark.parametrize("kind", ["images", "labels", "depth", "measured", "ids", "berries", "records"])
+@pytest.mark.parametrize("kind", ["images", "depth", "measured", "ids", "berries", "records"])
 def test_a_damaged_file_makes_its_image_missing(whole: pathlib.Path, tmp_path: pathlib.Path, kind: str, damage) -> None:
     out = tmp_path / "set"
     shutil.copytree(whole, out)

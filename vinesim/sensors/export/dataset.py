@@ -5,6 +5,9 @@ with equal results. An image is complete when its record exists, which is writte
 the record. Files that were deleted, truncated or partly copied are rendered again. Checksums would also find changed
 bytes, but would require reading the whole data set at every start; a check of sizes needs one system call for each
 file.
+
+The files that trainers read (COCO, YOLO) are made of the records after the last image, in the forms that they are asked
+for. So a finished data set takes another form without rendering.
 """
 
 from __future__ import annotations
@@ -59,6 +62,8 @@ MIN_ACTOR_SHARE = 0.01
 _MAX_TRIES = 60
 _TRIES_WITH_ACTORS = 30
 _FOLDERS = ("images", "labels", "depth", "measured", "ids", "berries", "records")
+_DERIVED_FOLDERS = ("labels", "records")
+"""Folders without files that an image's record lists."""
 _SUFFIXES = {"labels": ".txt", "records": ".json"}
 """File suffixes in the folders of a data set that do not contain PNG files."""
 SPLITS = ("train", "val", "test")
@@ -220,7 +225,6 @@ class VineyardRenderer:
             pixels |= {f"{mount.name}/{name}": values for name, values in kept.images.items()}
             record.setdefault("sensors", {})[mount.name] = kept.record
         files = {_file_of(kind, image): picture.encode_png(values) for kind, values in pixels.items()}
-        files[_file_of("labels", image)] = formats.yolo_labels(bunches, self.info.width, self.info.height).encode()
         record["files"] = {name: len(data) for name, data in files.items()}
         files[_file_of("records", image)] = formats.json_text(record).encode()
         for kind in pixels:
@@ -373,7 +377,7 @@ def missing_images(folder: pathlib.Path, images: int) -> list[int]:
 
 def _is_whole(folder: pathlib.Path, image: int) -> bool:
     """Returns whether the record of an image exists, and each of the image's files has the size in the record."""
-    expected = {_file_of(kind, image) for kind in _FOLDERS if kind != "records"}
+    expected = {_file_of(kind, image) for kind in _FOLDERS if kind not in _DERIVED_FOLDERS}
     try:
         record = msgspec.json.decode((folder / _file_of("records", image)).read_bytes(), type=_RecordedFiles)
         return record.files.keys() >= expected and all(
@@ -401,31 +405,42 @@ def render_images(plan: DatasetPlan, folder: pathlib.Path, images: Iterable[int]
         yield image
 
 
-def finish(folder: pathlib.Path, images: int) -> pathlib.Path:
-    """Write ``annotations.json`` (COCO) from the records of the first ``images`` images, ``data.yaml`` (YOLO) and the
-    lists of images that ``data.yaml`` names, one for each split that has images.
+def finish(folder: pathlib.Path, images: int, segmentation: str = "polygons", yolo: str = "detect") -> pathlib.Path:
+    """Write the files that trainers read, from the records of the first ``images`` images: ``annotations.json`` (COCO),
+    and for YOLO the folder ``labels``, ``data.yaml`` and the lists of images that it names, one for each split that has
+    images.
+
+    Args:
+        folder: folder of the data set.
+        images: number of images.
+        segmentation: form of the masks in ``annotations.json``, one of :data:`annotations.SEGMENTATIONS`.
+        yolo: task that the labels are for, one of :data:`annotations.YOLO_TASKS`.
 
     Returns the path of ``annotations.json``. Raises :class:`WriteError` if one of the files cannot be written; then no
     file is written.
     """
 
-    def read() -> Iterator[dict[str, Any]]:
-        for number in range(images):
-            yield json.loads((folder / _file_of("records", number)).read_text(encoding="utf-8"))
+    def record(number: int) -> dict[str, Any]:
+        return json.loads((folder / _file_of("records", number)).read_text(encoding="utf-8"))
+
+    def labels(number: int) -> Iterator[bytes]:
+        one = record(number)
+        yield formats.yolo_labels(one["bunches"], one["camera"]["width"], one["camera"]["height"], yolo).encode()
 
     target = folder / "annotations.json"
-    # Without `path`, Ultralytics uses the folder of data.yaml; a relative `path` would count from its working folder.
+    seed = json.loads((folder / "dataset.json").read_text(encoding="utf-8"))["seed"]
+    coco = formats.coco_json(lambda: map(record, range(images)), seed, segmentation)
+    files: dict[pathlib.Path, Iterable[bytes]] = {target: map(str.encode, coco)}
+    files |= {folder / _file_of("labels", number): labels(number) for number in range(images)}
     some = [split for split in SPLITS if split_needs(split) <= images]
-    yaml = "".join(f"{split}: {split}.txt\n" for split in some) + "names:\n  0: bunch\n"
-    files: dict[pathlib.Path, Iterable[bytes]] = {target: map(str.encode, formats.coco_json(read))}
     for split in some:  # `./` is relative to the list
         names = [f"./{_file_of('images', n)}\n" for n in range(images) if split_of(n) == split]
         files[folder / f"{split}.txt"] = map(str.encode, names)
-    files[folder / "data.yaml"] = [yaml.encode()]
+    files[folder / "data.yaml"] = [formats.yolo_settings(some, yolo).encode()]
     try:
         write_files(files)
     except OSError as bad:
-        raise _not_written("annotations.json and the lists", folder, bad) from None
+        raise _not_written("annotations.json, the labels and the lists", folder, bad) from None
     return target
 
 

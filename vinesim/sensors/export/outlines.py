@@ -34,7 +34,7 @@ def mask_polygons(mask: np.ndarray) -> list[list[int]]:
             continue
         holes = [rings[k] for k, parent in enumerate(parents) if parent == part]
         for hole in sorted(holes, key=lambda hole: int(hole[:, 0].min())):
-            ring = _cut_to_hole(double, ring, hole)  # noqa: PLW2901
+            ring = _cut_to_hole(double, ring, hole)
         polygons.append(_corners((ring + 1) // 2 + corner).ravel().tolist())
     return polygons
 
