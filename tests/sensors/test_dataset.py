@@ -267,12 +267,40 @@ def test_yolo_poses_are_boxes_and_cut_points(whole: pathlib.Path, copy: pathlib.
     assert len(shown) > 1
 
 
+def test_a_share_of_the_images_shows_no_bunch_and_the_others_stay(
+    scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    plan = DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE, negatives=0.5)
+    assert np.mean([plan.is_negative(image) for image in range(4000)]) == pytest.approx(0.5, abs=0.03)
+    dataset.prepare_folder(plan, tmp_path, IMAGES)
+    list(dataset.render_images(plan, tmp_path, range(IMAGES)))
+    dataset.finish(tmp_path, IMAGES)
+    negatives = [image for image in range(IMAGES) if plan.is_negative(image)]
+    assert 0 < len(negatives) < IMAGES
+    annotated = json.loads((tmp_path / "annotations.json").read_text())
+    assert len(annotated["images"]) == IMAGES
+    assert {one["image_id"] for one in annotated["annotations"]} == set(range(IMAGES)) - set(negatives)
+    files, others = _files(tmp_path), _files(whole)
+    for image in range(IMAGES):
+        organs = _ids(tmp_path / "ids" / f"{image:06d}.png") >> 20
+        assert (organs == Organ.BUNCH).any() == (image not in negatives)
+        if image in negatives:
+            assert files[f"labels/{image:06d}.txt"] == b""
+            assert np.isin(organs, [Organ.TRUNK, Organ.ARM, Organ.CANE, Organ.LEAF]).mean() >= dataset.MIN_PLANT_SHARE
+        else:
+            assert all(data == others[name] for name, data in files.items() if f"{image:06d}" in name)
+    with pytest.raises(DatasetError, match=r"begun with negatives 0.5, not 0.0"):
+        dataset.prepare_folder(DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE), tmp_path, IMAGES)
+
+
 def test_unknown_forms_are_refused_in_one_line(scene: pathlib.Path, tmp_path: pathlib.Path) -> None:
     given = {"images": 1, "out": tmp_path / "set", "scene": str(scene), "seed": 5, "camera": "d435", "size": None}
     given |= {"workers": 1, "actors": 0.0, "device": "cpu"}
     for option, words in (("segmentation", "polygons, rle or compressed"), ("yolo", "detect, segment or pose")):
         with pytest.raises(UsageError, match=f"--{option} is 'coco': give {words}"):
             run_dataset(**given, **{option: "coco"})
+    with pytest.raises(UsageError, match=r"--negatives is 1.5: give a share of the images, 0 to 1"):
+        run_dataset(**given, negatives=1.5)
     assert not (tmp_path / "set").exists()
 
 

@@ -65,6 +65,7 @@ def run(
     sensor: Sequence[str] | None = None,
     segmentation: str = "polygons",
     yolo: str = "detect",
+    negatives: float = 0.0,
 ) -> int:
     """Render the missing images, then gather the annotations of all images. Returns the exit code."""
     if seed < 0:
@@ -75,6 +76,8 @@ def run(
         )
     if not 0.0 <= actors <= 1.0:
         raise UsageError(f"--actors is {actors:g}: give a share of the images, 0 to 1")
+    if not 0.0 <= negatives <= 1.0:
+        raise UsageError(f"--negatives is {negatives:g}: give a share of the images, 0 to 1")
     for option, given, known in (
         ("--segmentation", segmentation, annotations.SEGMENTATIONS),
         ("--yolo", yolo, annotations.YOLO_TASKS),
@@ -92,6 +95,7 @@ def run(
         randomizer,
         device,
         parse_sensors(sensor or (), None if size is None else parse_size(size)),
+        negatives,
     )
     running: list[Worker] = []
     try:

@@ -162,6 +162,9 @@ def dataset(
     actors: Annotated[
         float, typer.Option(help="Share of the images with people, robots, crates and wind; 0: vines only.")
     ] = 0.4,
+    negatives: Annotated[
+        float, typer.Option(help="Share of the images in which no bunch is visible, with empty labels.")
+    ] = 0.0,
     segmentation: Annotated[
         str, typer.Option(help="Masks in COCO: polygons, rle (a list of run lengths) or compressed (RLE as text).")
     ] = "polygons",

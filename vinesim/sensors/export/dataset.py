@@ -27,7 +27,7 @@ from vinesim.core.version import __version__
 from vinesim.scene.berries import VARIETIES
 from vinesim.scene.camera_geometry import depth_millimetres
 from vinesim.scene.generation.vineyard import generate_uncached
-from vinesim.scene.ids import Organ, label
+from vinesim.scene.ids import LABEL_STRIDE, Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene, Season, sun_direction
 from vinesim.scene.values import CameraInfo, RenderedMount, Snapshot
@@ -59,8 +59,12 @@ LATITUDE = np.radians(41.6)
 """Latitude [rad] of the vineyards near Aprilia, Italy, where CANOPIES picks; it determines the sun's path."""
 MIN_ACTOR_SHARE = 0.01
 """Least share of a picture's pixels that show actors or boxes, in scenes that have any."""
+MIN_PLANT_SHARE = 0.02
+"""Least share of the pixels of a picture without bunches that show a plant."""
 _MAX_TRIES = 60
 _TRIES_WITH_ACTORS = 30
+_TRIES_WITHOUT_BUNCHES = 300
+_TRIES_UNTIL_DOWN = 60
 _FOLDERS = ("images", "labels", "depth", "measured", "ids", "berries", "records")
 _DERIVED_FOLDERS = ("labels", "records")
 """Folders without files that an image's record lists."""
@@ -132,6 +136,12 @@ class DatasetPlan:
     device: str = "cpu"
     sensors: tuple[RenderedMount, ...] = ()
     """Further sensors, which are rendered from the camera's pose."""
+    negatives: float = 0.0
+    """Share of the pictures in which no bunch is visible, 0 to 1."""
+
+    def is_negative(self, image: int) -> bool:
+        """Returns whether no bunch shall be visible in image ``image``."""
+        return bool(np.random.default_rng([self.seed, 7, image]).random() < self.negatives)
 
     def settings(self) -> dict[str, Any]:
         """Returns all settings that determine the images, for JSON."""
@@ -145,6 +155,7 @@ class DatasetPlan:
             "device": self.device.partition(":")[0],  # without the index, because all GPUs render equal images
             "life": None if self.snapshot_source is None else self.snapshot_source.settings(),
             "sensors": {m.name: {"kind": m.kind} | msgspec.to_builtins(m) for m in self.sensors} or None,
+            "negatives": self.negatives,
         }
 
     def vineyard(self, number: int) -> Scene:
@@ -179,7 +190,11 @@ class VineyardRenderer:
         rng = np.random.default_rng([self.plan.seed, 2, image])
         hour, sun = _random_sun(rng)
         snapshot, near, activity = self._pose_scene(image)
-        seen = self._choose_view(rng, snapshot, near, [(one["x"], one["y"]) for one in activity.get("actors", [])])
+        is_negative = self.plan.is_negative(image)
+        if is_negative:
+            seen = self._choose_view_without_bunches(rng, snapshot, near)
+        else:
+            seen = self._choose_view(rng, snapshot, near, [(one["x"], one["y"]) for one in activity.get("actors", [])])
         truths = ground_truth.bunch_truths(self.primitives, snapshot, seen, self.caster)
         camera = Camera(
             self.spec,
@@ -200,6 +215,7 @@ class VineyardRenderer:
             "image": image,
             "file": _file_of("images", image),
             "split": split_of(image),
+            "negative": is_negative,
             "scene": {
                 "name": self.scene.name,
                 "seed": self.scene.seed,
@@ -253,17 +269,10 @@ class VineyardRenderer:
         ``near``: point [2] m of the ground near which the bunch hangs; ``actors``: positions [m], one of which is in
         view too, unless too many tries fail.
         """
-        model = self.model
-        hanging = np.flatnonzero(snapshot.bunch_attached)
-        if near is not None:
-            away = np.linalg.norm(snapshot.body_q[model.bunch_body[hanging], :2] - near, axis=1)
-            hanging = hanging[away < MAX_ACTOR_DISTANCE] if (away < MAX_ACTOR_DISTANCE).any() else hanging
-        if not len(hanging):
-            raise DatasetError(f"scene {self.scene.name!r} bears too few bunches; raise fruit.bunches")
+        hanging = self._hanging_bunches(snapshot, near)
         for attempt in range(_MAX_TRIES):
             bunch = int(hanging[rng.integers(len(hanging))])
-            pose = snapshot.body_q[model.bunch_body[bunch]].astype(float)
-            middle = pose[:3] + frames.rotate(pose[3:], np.array([0.5 * model.bunch_length[bunch], 0.0, 0.0]))
+            middle = self._middle_of_bunch(snapshot, bunch)
             height = rng.uniform(*CAMERA_HEIGHT)
             away = rng.uniform(*BUNCH_DISTANCE)
             around = rng.uniform(0.0, 2.0 * np.pi)
@@ -275,11 +284,9 @@ class VineyardRenderer:
             eye = np.array([*(middle[:2] + level * np.array([np.cos(around), np.sin(around)])), height])
             aim = middle + rng.normal(0.0, 0.12, 3) * min(away, 1.0)
             roll = frames.exp(np.array([0.0, 0.0, rng.normal(0.0, 0.03)]))
-            if np.linalg.norm(aim - eye) < 0.1 or enclosing_primitive(self.primitives, eye) >= 0:
+            seen = self._look(eye, aim, roll)
+            if seen is None:
                 continue
-            optical = picture.look_at(eye, aim)
-            optical[3:] = frames.multiply(optical[3:], roll)
-            seen = ground_truth.render_buffers(self.primitives, self.info, optical)
             shown = (seen.labels == label(Organ.BUNCH, bunch)).sum()
             if (
                 actors
@@ -287,9 +294,66 @@ class VineyardRenderer:
                 and (seen.labels >= label(Organ.BOX, 0)).mean() < MIN_ACTOR_SHARE
             ):
                 continue
-            if (seen.depth < MIN_CLEARANCE).mean() < 0.02 and shown >= formats.MIN_ANNOTATED_PIXELS:
+            if shown >= formats.MIN_ANNOTATED_PIXELS:
                 return seen
         raise DatasetError(f"scene {self.scene.name!r} has no open place near its bunches, in {_MAX_TRIES} tries")
+
+    def _choose_view_without_bunches(
+        self, rng: np.random.Generator, snapshot: Snapshot, near: np.ndarray | None
+    ) -> ground_truth.PixelBuffers:
+        """Returns a view from a free place near a random hanging bunch, in a direction in which a plant is visible, but
+        no bunch.
+
+        ``near``: point [2] m of the ground near which the bunch hangs.
+        """
+        hanging = self._hanging_bunches(snapshot, near)
+        for attempt in range(_TRIES_WITHOUT_BUNCHES):
+            middle = self._middle_of_bunch(snapshot, int(hanging[rng.integers(len(hanging))]))
+            bearing, heading = rng.uniform(0.0, 2.0 * np.pi, 2)
+            away = rng.uniform(*BUNCH_DISTANCE)
+            eye = np.array([*(middle[:2] + away * np.array([np.cos(bearing), np.sin(bearing)])), 0.0])
+            eye[2] = rng.uniform(*CAMERA_HEIGHT)
+            # Bunches hang at the height of the camera. So later tries look farther down, at trunks and the ground.
+            pitch = rng.uniform(-0.3, 0.3) - 0.9 * min(attempt / _TRIES_UNTIL_DOWN, 1.0)
+            level = np.array([np.cos(heading), np.sin(heading), 0.0])
+            aim = eye + np.cos(pitch) * level + [0.0, 0.0, np.sin(pitch)]
+            seen = self._look(eye, aim, frames.exp(np.array([0.0, 0.0, rng.normal(0.0, 0.03)])))
+            if seen is None:
+                continue
+            organs = seen.labels // LABEL_STRIDE
+            is_plant = (organs >= Organ.TRUNK) & (organs <= Organ.LEAF)
+            if not (organs == Organ.BUNCH).any() and is_plant.mean() >= MIN_PLANT_SHARE:
+                return seen
+        raise DatasetError(
+            f"scene {self.scene.name!r} has no view of a plant without bunches, in {_TRIES_WITHOUT_BUNCHES} tries; lower "
+            "fruit.bunches, or give --negatives 0"
+        )
+
+    def _hanging_bunches(self, snapshot: Snapshot, near: np.ndarray | None) -> np.ndarray:
+        """Returns the indices of the hanging bunches; if possible only of those around the point ``near`` [2] m of the
+        ground."""
+        hanging = np.flatnonzero(snapshot.bunch_attached)
+        if near is not None:
+            away = np.linalg.norm(snapshot.body_q[self.model.bunch_body[hanging], :2] - near, axis=1)
+            hanging = hanging[away < MAX_ACTOR_DISTANCE] if (away < MAX_ACTOR_DISTANCE).any() else hanging
+        if not len(hanging):
+            raise DatasetError(f"scene {self.scene.name!r} bears too few bunches; raise fruit.bunches")
+        return hanging
+
+    def _middle_of_bunch(self, snapshot: Snapshot, bunch: int) -> np.ndarray:
+        """Returns the middle [3] m of a bunch's rachis."""
+        pose = snapshot.body_q[self.model.bunch_body[bunch]].astype(float)
+        return pose[:3] + frames.rotate(pose[3:], np.array([0.5 * self.model.bunch_length[bunch], 0.0, 0.0]))
+
+    def _look(self, eye: np.ndarray, aim: np.ndarray, roll: np.ndarray) -> ground_truth.PixelBuffers | None:
+        """Returns the view from ``eye`` [3] m to ``aim`` [3] m, turned by the quaternion ``roll`` [4]; None if the
+        place is not free, or something is too near."""
+        if np.linalg.norm(aim - eye) < 0.1 or enclosing_primitive(self.primitives, eye) >= 0:
+            return None
+        optical = picture.look_at(eye, aim)
+        optical[3:] = frames.multiply(optical[3:], roll)
+        seen = ground_truth.render_buffers(self.primitives, self.info, optical)
+        return seen if (seen.depth < MIN_CLEARANCE).mean() < 0.02 else None
 
 
 def _random_sun(rng: np.random.Generator) -> tuple[float, tuple[float, float, float]]:
