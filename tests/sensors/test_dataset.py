@@ -209,6 +209,27 @@ def test_masks_in_every_form_are_those_of_the_ids(copy: pathlib.Path, form: str)
         assert np.array_equal(pixels, ids == label(Organ.BUNCH, one["bunch"]))
 
 
+@pytest.mark.parametrize("form", annotations.SEGMENTATIONS)
+def test_supervision_reads_masks_of_every_form(copy: pathlib.Path, form: str) -> None:
+    """It fills polygons with their boundary, which adds up to a pixel to the right and below; run lengths are exact."""
+    supervision = pytest.importorskip("supervision", reason="supervision is no dependency of vinesim")
+    dataset.finish(copy, IMAGES, form)
+    read = supervision.DetectionDataset.from_coco(str(copy), str(copy / "annotations.json"), force_masks=True)
+    assert read.classes == ["bunch"]
+    annotated = json.loads((copy / "annotations.json").read_text())["annotations"]
+    assert len(read) == IMAGES
+    for path, _, found in read:
+        image = int(pathlib.Path(path).stem)
+        ids = _ids(copy / "ids" / f"{image:06d}.png")
+        bunches = [one["bunch"] for one in annotated if one["image_id"] == image]
+        assert found.class_id.tolist() == [0] * len(bunches)
+        for mask, bunch in zip(found.mask, bunches, strict=True):
+            truth = ids == label(Organ.BUNCH, bunch)
+            most = cv2.dilate(truth.astype(np.uint8), np.ones((2, 2)), anchor=(1, 1)).astype(bool)
+            assert not (truth & ~mask).any()
+            assert not (mask & ~(most if form == "polygons" else truth)).any()
+
+
 def test_coco_file_names_version_seed_and_licence_but_no_date(whole: pathlib.Path, copy: pathlib.Path) -> None:
     said = json.loads((copy / "annotations.json").read_text())
     assert said["info"]["version"] == __version__
@@ -291,6 +312,42 @@ def test_a_share_of_the_images_shows_no_bunch_and_the_others_stay(
             assert all(data == others[name] for name, data in files.items() if f"{image:06d}" in name)
     with pytest.raises(DatasetError, match=r"begun with negatives 0.5, not 0.0"):
         dataset.prepare_folder(DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE), tmp_path, IMAGES)
+
+
+def test_semantic_images_have_the_classes_of_the_ids(
+    scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    plan = DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE, semantic=True)
+    dataset.prepare_folder(plan, tmp_path, IMAGES)
+    list(dataset.render_images(plan, tmp_path, range(IMAGES)))
+    assert dataset.missing_images(tmp_path, IMAGES) == []
+    names = json.loads((tmp_path / "dataset.json").read_text())["semantic"]
+    organs_of = {
+        "sky": Organ.NOTHING,
+        "soil": Organ.GROUND,
+        "grass": Organ.GROUND,
+        "post": Organ.POLE,
+        "berry": Organ.BUNCH,
+        "person": Organ.HUMAN,
+    }
+    shown = set()
+    for image in range(IMAGES):
+        classes = cv2.imread(str(tmp_path / "semantic" / f"{image:06d}.png"), cv2.IMREAD_UNCHANGED)
+        assert classes.dtype == np.uint8
+        organs = _ids(tmp_path / "ids" / f"{image:06d}.png") >> 20
+        assert classes.shape == organs.shape
+        for value in np.unique(classes):
+            name = names[str(value)]
+            organ = organs_of[name] if name in organs_of else Organ[name.upper()]
+            assert (organs[classes == value] == organ).all()
+            shown.add(name)
+        berry = cv2.imread(str(tmp_path / "berries" / f"{image:06d}.png"), cv2.IMREAD_UNCHANGED)
+        assert np.array_equal(classes == annotations.SEMANTIC_CLASSES.index("berry"), berry > 0)
+    assert {"sky", "soil", "grass", "leaf", "cane", "bunch", "berry"} <= shown
+    files = {name: data for name, data in _files(whole).items() if name.endswith(".png")}
+    assert {name: _files(tmp_path)[name] for name in files} == files
+    (tmp_path / "semantic" / "000002.png").unlink()
+    assert dataset.missing_images(tmp_path, IMAGES) == [2]
 
 
 def test_unknown_forms_are_refused_in_one_line(scene: pathlib.Path, tmp_path: pathlib.Path) -> None:

@@ -66,6 +66,7 @@ def run(
     segmentation: str = "polygons",
     yolo: str = "detect",
     negatives: float = 0.0,
+    semantic: bool = False,
 ) -> int:
     """Render the missing images, then gather the annotations of all images. Returns the exit code."""
     if seed < 0:
@@ -96,6 +97,7 @@ def run(
         device,
         parse_sensors(sensor or (), None if size is None else parse_size(size)),
         negatives,
+        semantic,
     )
     running: list[Worker] = []
     try:

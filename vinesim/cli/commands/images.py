@@ -171,6 +171,7 @@ def dataset(
     yolo: Annotated[
         str, typer.Option(help="Labels for YOLO: detect (boxes), segment (polygons) or pose (boxes and cut points).")
     ] = "detect",
+    semantic: Annotated[bool, typer.Option("--semantic", help="Write an image of each pixel's class, too.")] = False,
 ) -> None:
     """Render random pictures of random vineyards with their ground truth: COCO with masks, YOLO, depth, ids, poses.
 

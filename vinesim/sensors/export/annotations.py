@@ -12,7 +12,7 @@ import numpy as np
 from vinesim.core.version import __version__
 from vinesim.scene.berries import VARIETIES
 from vinesim.scene.camera_geometry import distortion_model, intrinsic_matrix
-from vinesim.scene.ids import ObjectKind, object_id, object_name
+from vinesim.scene.ids import LABEL_STRIDE, ObjectKind, Organ, object_id, object_name
 from vinesim.scene.values import MIN_BERRY_PIXELS, Box, BunchTruth, CameraInfo
 from vinesim.sensors.export.outlines import join_polygons, mask_polygons
 from vinesim.sensors.ground_truth import PixelBuffers
@@ -36,6 +36,32 @@ SEGMENTATIONS = ("polygons", "rle", "compressed")
 """Forms of ``segmentation`` in COCO files: polygons, run lengths as a list, and run lengths as text."""
 YOLO_TASKS = ("detect", "segment", "pose")
 """Forms of YOLO label files, by the names of Ultralytics' tasks: box, polygon, and box with cut point."""
+
+SEMANTIC_CLASSES = (
+    "sky",
+    "soil",
+    "grass",
+    "leaf",
+    "cane",
+    "trunk",
+    "arm",
+    "wire",
+    "post",
+    "peduncle",
+    "bunch",
+    "berry",
+    "person",
+    "robot",
+    "box",
+)
+"""Names of the classes in semantic images, by value of the pixel. ``bunch`` is the part of a bunch that is no berry."""
+_CLASS_OF_ORGAN = {
+    Organ.NOTHING: "sky",
+    Organ.GROUND: "soil",
+    Organ.POLE: "post",
+    Organ.HUMAN: "person",
+}
+"""Class of those organs that have another name than their class."""
 
 
 def encode_mask(mask: np.ndarray) -> dict[str, Any]:
@@ -250,6 +276,18 @@ def _cut_keypoint(bunch: dict[str, Any], width: int, height: int) -> list[Any]:
 def encode_labels(labels: np.ndarray) -> np.ndarray:
     """Returns labels [height, width] encoded as RGB with ``id = R + 256 G + 65536 B``, as in COCO's panoptic images."""
     return np.stack([labels & 255, labels >> 8 & 255, labels >> 16 & 255], -1).astype(np.uint8)
+
+
+def encode_classes(seen: PixelBuffers) -> np.ndarray:
+    """Returns an image [height, width] uint8 with the index of each pixel's class in :data:`SEMANTIC_CLASSES`."""
+    index = {name: number for number, name in enumerate(SEMANTIC_CLASSES)}
+    table = np.array([index[_CLASS_OF_ORGAN.get(organ, organ.name.lower())] for organ in Organ], np.uint8)
+    organs = seen.labels // LABEL_STRIDE
+    classes = table[organs]
+    is_on_ground = (organs == Organ.GROUND) & (seen.primitive >= 0)  # the surface of the ground is no primitive
+    classes[is_on_ground] = index["grass"]
+    classes[seen.berries >= 0] = index["berry"]
+    return classes
 
 
 def encode_berry_numbers(seen: PixelBuffers) -> np.ndarray:

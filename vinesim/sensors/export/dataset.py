@@ -139,6 +139,9 @@ class DatasetPlan:
     negatives: float = 0.0
     """Share of the pictures in which no bunch is visible, 0 to 1."""
 
+    semantic: bool = False
+    """Whether to write an image of the class of each pixel too, see :func:`annotations.encode_classes`."""
+
     def is_negative(self, image: int) -> bool:
         """Returns whether no bunch shall be visible in image ``image``."""
         return bool(np.random.default_rng([self.seed, 7, image]).random() < self.negatives)
@@ -156,6 +159,7 @@ class DatasetPlan:
             "life": None if self.snapshot_source is None else self.snapshot_source.settings(),
             "sensors": {m.name: {"kind": m.kind} | msgspec.to_builtins(m) for m in self.sensors} or None,
             "negatives": self.negatives,
+            "semantic": dict(enumerate(formats.SEMANTIC_CLASSES)) if self.semantic else None,
         }
 
     def vineyard(self, number: int) -> Scene:
@@ -235,6 +239,8 @@ class VineyardRenderer:
             "ids": formats.encode_labels(frame.labels),
             "berries": formats.encode_berry_numbers(seen),
         }
+        if self.plan.semantic:
+            pixels["semantic"] = formats.encode_classes(seen)
         setting = SensorSetting(sun, self.plan.seed, image, self.plan.device, threads=1)
         for mount in self.plan.sensors:
             kept = export_frame(mount, self.primitives, snapshot, seen.pose, setting)
@@ -325,8 +331,8 @@ class VineyardRenderer:
             if not (organs == Organ.BUNCH).any() and is_plant.mean() >= MIN_PLANT_SHARE:
                 return seen
         raise DatasetError(
-            f"scene {self.scene.name!r} has no view of a plant without bunches, in {_TRIES_WITHOUT_BUNCHES} tries; lower "
-            "fruit.bunches, or give --negatives 0"
+            f"scene {self.scene.name!r} has no view of a plant without bunches, in {_TRIES_WITHOUT_BUNCHES} tries; "
+            "lower fruit.bunches, or give --negatives 0"
         )
 
     def _hanging_bunches(self, snapshot: Snapshot, near: np.ndarray | None) -> np.ndarray:
