@@ -189,17 +189,29 @@ def dataset(
     actors: Annotated[
         float, typer.Option(help="Share of the images with people, robots, crates and wind; 0: vines only.")
     ] = 0.4,
+    negatives: Annotated[
+        float, typer.Option(help="Share of the images in which no bunch is visible, with empty labels.")
+    ] = 0.0,
+    segmentation: Annotated[
+        str, typer.Option(help="Masks in COCO: polygons, rle (a list of run lengths) or compressed (RLE as text).")
+    ] = "polygons",
+    yolo: Annotated[
+        str, typer.Option(help="Labels for YOLO: detect (boxes), segment (polygons) or pose (boxes and cut points).")
+    ] = "detect",
+    semantic: Annotated[bool, typer.Option("--semantic", help="Write an image of each pixel's class, too.")] = False,
 ) -> None:
     """Render random pictures of random vineyards with their ground truth: COCO with masks, YOLO, depth, ids, poses.
 
     Seed of the vines, leaves, varieties, ripeness, hour and season of the sun, actors and the viewpoint are random.
     After an interruption the same command continues, and renders deleted or truncated images again. A later run may
-    ask for more images; fewer are refused. The five images of a vineyard are in one split. Of every ten
+    ask for more images; fewer are refused. It may also ask for other masks and labels, which are made without
+    rendering. The five images of a vineyard are in one split. Of every ten
     vineyards the second is for validation and the third for tests; the others are for training.
 
     \b
     Examples:
       vinesim dataset --images 1000 --out grapes
+      vinesim dataset --images 1000 --out grapes --yolo segment
       vinesim dataset --images 100000 --out /shared/grapes --scheduler tcp://HOST:8786
       vinesim dataset --images 200 --out vsp --scene vsp --seed 3 --camera pinhole --size 320x240 --workers 4
     """

@@ -77,12 +77,12 @@ def label_colours(labels: np.ndarray) -> np.ndarray:
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """Returns an image, RGB uint8 or grey uint16, encoded as PNG; :class:`ValueError` for other types."""
+    """Returns an image, RGB uint8, or grey uint8 or uint16, encoded as PNG; :class:`ValueError` for other types."""
     data = image[..., ::-1] if image.ndim == 3 else image
     done, encoded = cv2.imencode(".png", np.ascontiguousarray(data))
     if not done:
         raise ValueError(
-            f"an image of shape {image.shape}, {image.dtype}, cannot be a PNG; give uint8 RGB or uint16 grey"
+            f"an image of shape {image.shape}, {image.dtype}, cannot be a PNG; give uint8 RGB, or uint8 or uint16 grey"
         )
     return encoded.tobytes()
 
