@@ -69,7 +69,10 @@ def scene_import_plant(
 
 def export(
     scene: Annotated[str, typer.Argument(help="A scene file, or demo, harvest, tendone, vsp.")],
-    out: Annotated[pathlib.Path, typer.Option(help="File to write; its suffix chooses the format: .xml (MJCF), .urdf, .usda, .usdc or .usd.")],
+    out: Annotated[
+        pathlib.Path,
+        typer.Option(help="File to write; its suffix chooses the format: .xml (MJCF), .urdf, .usda, .usdc or .usd."),
+    ],
     seed: Seed = None,
     leaves: Annotated[
         bool, typer.Option("--leaves", help="Draw the leaves. They do not collide, and make the file twice as large.")
