@@ -18,7 +18,8 @@ def export_vineyard(source: Source, file: str | os.PathLike[str], *, leaves: boo
 
     Args:
         source: a model; a scene; the name or the file of a scene; one or more builders of canes or trees.
-        file: MJCF (``.xml``), URDF (``.urdf``), or OpenUSD (``.usda``, ``.usdc``, ``.usd``; needs the extra ``export``).
+        file: MJCF (``.xml``), URDF (``.urdf``), or OpenUSD (``.usda``, ``.usdc``, ``.usd``), which needs the extra
+            ``export``.
         leaves: whether leaves are drawn. They never collide; their mass is always part of their cane.
 
     Raises:

@@ -16,11 +16,11 @@ from vinesim.export.xml_text import add, text
 from vinesim.scene.ids import Organ
 
 INNER_SHARE = 1e-7
-"""Share of a body's mass that each of the two links between its three hinges has. DERIVED: programs refuse a moving link
-without mass; with this share the masses of body and links together, and of the body, stay the same within 1e-6."""
+"""Share of a body's mass that each of the two links between its three hinges has. DERIVED: programs refuse a moving
+link without mass; with this share the masses of body and links together, and of the body, stay the same within 1e-6."""
 INNER_INERTIA = 1e-12
-"""[kg m^2] Inertia of each of these links. DERIVED: a thousandth of the smallest inertia of a piece of cane, and above the
-1e-15 that MuJoCo takes for 0."""
+"""[kg m^2] Inertia of each of these links. DERIVED: half a percent of the smallest inertia in the shipped scenes, and
+above the 1e-15 that MuJoCo takes for 0."""
 GROUND_SIZE = (200.0, 200.0, 0.2)
 """[m] Box in place of a plane, which a URDF lacks."""
 NO_LIMIT = 1e6

@@ -1,7 +1,7 @@
 """The vineyard as OpenUSD with the schemas of UsdPhysics, by the package ``usd-core``, which is an extra.
 
-Each tree is an articulation of rigid bodies. A ball joint is a joint with locked translations and a spring (drive) about
-each of its axes; a tie is one with a spring along each axis.
+Each tree is an articulation of rigid bodies. A ball joint is a joint with locked translations and a spring (drive)
+about each of its axes; a tie is one with a spring along each axis.
 """
 
 from __future__ import annotations
