@@ -25,6 +25,14 @@ def one_vine() -> Model:
     return vinesim.generate(msgspec.structs.replace(scene, layout=layout, spawns=()))
 
 
+@functools.cache
+def vine_on_a_slope() -> Model:
+    """Returns one vine of the scene slope, whose ground is uneven."""
+    scene = vinesim.load_scene("slope")
+    layout = msgspec.structs.replace(scene.layout, rows=1, vines=1)
+    return vinesim.generate(msgspec.structs.replace(scene, layout=layout, spawns=()))
+
+
 def bodies_of(model: Model, names: list[str]) -> np.ndarray:
     """Returns the index in the model of each exported body of a plant, by its name."""
     return np.array(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import vinesim
-from tests.export.scenes import bent_cane, bodies_of, one_vine
+from tests.export.scenes import bent_cane, bodies_of, one_vine, vine_on_a_slope
 from tests.export.small_vibrations import model_frequencies
 from tests.export.swings import crossing_frequency, modes
 from tests.support.clustered_trees import clustered
@@ -160,3 +160,21 @@ def test_the_demo_stands_for_a_second_in_mujoco(tmp_path):
     print(f"{world.nbody} bodies, 1 s in {time.perf_counter() - begin:.1f} s")
     assert np.abs(data.xpos - start).max() < 1e-3
     assert not data.warning.number.any()
+
+
+def test_uneven_ground_is_a_height_field_with_the_heights_of_the_model(tmp_path):
+    model = vine_on_a_slope()
+    world = load(model, tmp_path)
+    data = mujoco.MjData(world)
+    mujoco.mj_kinematics(world, data)
+    low, high = np.array(model.terrain.origin), np.array(model.terrain.end)
+    hit = np.zeros(1, np.int32)
+    for x, y in np.random.default_rng(1).uniform(low + 0.1, high - 0.1, (50, 2)):
+        far = mujoco.mj_rayHfield(world, data, world.geom("ground").id, [x, y, 50.0], [0.0, 0.0, -1.0], None)
+        assert 50.0 - far == pytest.approx(float(model.terrain.height(x, y)), abs=2e-4), hit
+    assert np.ptp(model.terrain.nodes()) > 0.1
+
+
+def test_a_urdf_of_uneven_ground_is_refused_in_one_line(tmp_path):
+    with pytest.raises(vinesim.UsageError, match="a URDF has no uneven ground, which this scene has; write MJCF"):
+        vinesim.export_vineyard(vine_on_a_slope(), tmp_path / "vineyard.urdf")

@@ -16,6 +16,7 @@ from vinesim.rigid.static_world import CRATE_COLOR, boxes_of, crate_shapes
 from vinesim.scene.builder import GRAVITY
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
+from vinesim.scene.terrain import Terrain
 from vinesim.wires.elastic_supports import arm_compliance, wire_compliance
 
 HINGES = ("twist", "bend_y", "bend_z")
@@ -139,6 +140,8 @@ class Vineyard:
     """[s] Step at which springs that are explicit in position are stable."""
     gravity: float
     friction: float
+    terrain: Terrain | None
+    """Uneven ground; None: the plane z = 0."""
 
 
 def describe(
@@ -167,6 +170,7 @@ def describe(
     links = _links(model, np.flatnonzero(kept), mass, com, inertia, springs, leaves)
     number = np.cumsum(kept) - 1
     return Vineyard(
+        terrain=model.terrain,
         name=name,
         links=links,
         ties=_ties(model, number),

@@ -10,6 +10,7 @@ from vinesim.core import frames
 from vinesim.export.articulation import COLORS, HINGES, Capsule, Tie, Vineyard
 from vinesim.export.xml_text import add, text
 from vinesim.scene.ids import Organ
+from vinesim.scene.terrain import Terrain
 
 TIE_REACH = 1.0
 """[m] Length of the tendons that replace ties. DERIVED: a tie that moves by d across a tendon lengthens it by d^2 / 2,
@@ -38,7 +39,10 @@ def mjcf(vineyard: Vineyard) -> _Element:
     _add_defaults(root, vineyard.friction)
     world = add(root, "worldbody")
     add(world, "light", pos="0 0 10", dir="0.3 0.2 -1", directional="true")
-    add(world, "geom", name="ground", type="plane", size="0 0 1", class_="ground")
+    if vineyard.terrain is None:
+        add(world, "geom", name="ground", type="plane", size="0 0 1", class_="ground")
+    else:
+        _add_height_field(add(root, "asset"), world, vineyard.terrain)
     for piece in vineyard.fixed:
         add(world, "geom", name=piece.name, class_=piece.organ.name.lower(), **_shape(piece.capsule))
     _add_crates(world, vineyard)
@@ -48,6 +52,26 @@ def mjcf(vineyard: Vineyard) -> _Element:
         for tie in vineyard.ties:
             _add_tie(world, bodies[tie.link], tendons, tie)
     return root
+
+
+def _add_height_field(assets: _Element, world: _Element, terrain: Terrain) -> None:
+    """Add the uneven ground as a height field, whose cells MuJoCo divides into the same triangles as ``terrain``."""
+    heights = terrain.nodes()
+    low = float(heights.min())
+    rise = max(float(heights.max()) - low, 1e-3)
+    half = 0.5 * (np.array(terrain.end) - terrain.origin)
+    add(
+        assets,
+        "hfield",
+        name="ground",
+        nrow=str(heights.shape[0]),
+        ncol=str(heights.shape[1]),
+        size=text(*half, rise, 1.0),
+        # MJCF lists the rows from the highest y on
+        elevation=text(*((heights[::-1] - low) / rise).ravel().tolist()),
+    )
+    middle = 0.5 * (np.array(terrain.end) + terrain.origin)
+    add(world, "geom", name="ground", type="hfield", hfield="ground", pos=text(*middle, low), class_="ground")
 
 
 def _add_defaults(root: _Element, friction: float) -> None:

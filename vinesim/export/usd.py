@@ -15,6 +15,7 @@ import numpy as np
 from vinesim.core import frames
 from vinesim.export.articulation import COLORS, Capsule, Link, Tie, Vineyard
 from vinesim.scene.ids import Organ
+from vinesim.scene.terrain import Terrain
 
 
 class UsdMissing(RuntimeError):
@@ -63,11 +64,7 @@ class _StageWriter:
         scene.CreateGravityDirectionAttr(pxr.Gf.Vec3f(0.0, 0.0, -1.0))
         scene.CreateGravityMagnitudeAttr(vineyard.gravity)
         self._bind_friction(world.GetPrim(), vineyard.friction)
-        ground = pxr.UsdGeom.Plane.Define(stage, "/World/ground")
-        ground.CreateAxisAttr("Z")
-        ground.CreateWidthAttr(200.0)
-        ground.CreateLengthAttr(200.0)
-        self._finish_shape(ground, Organ.GROUND, [(-100.0, -100.0, 0.0), (100.0, 100.0, 0.0)])
+        self._ground(vineyard.terrain)
         self._group("plants")
         self._group("fixed")
         for piece in vineyard.fixed:
@@ -191,6 +188,25 @@ class _StageWriter:
         self._finish_shape(cube, organ, [(-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)], collides=collides)
         return cube
 
+    def _ground(self, terrain: Terrain | None) -> None:
+        """Add the plane z = 0, or the triangles of uneven ground."""
+        pxr = self._pxr
+        if terrain is None:
+            ground = pxr.UsdGeom.Plane.Define(self.stage, "/World/ground")
+            ground.CreateAxisAttr("Z")
+            ground.CreateWidthAttr(200.0)
+            ground.CreateLengthAttr(200.0)
+            self._finish_shape(ground, Organ.GROUND, [(-100.0, -100.0, 0.0), (100.0, 100.0, 0.0)])
+            return
+        points, triangles = _ground_mesh(terrain)
+        ground = pxr.UsdGeom.Mesh.Define(self.stage, "/World/ground")
+        ground.CreatePointsAttr(pxr.Vt.Vec3fArray.FromNumpy(points.astype(np.float32)))
+        ground.CreateFaceVertexIndicesAttr(pxr.Vt.IntArray.FromNumpy(triangles.ravel().astype(np.int32)))
+        ground.CreateFaceVertexCountsAttr(pxr.Vt.IntArray.FromNumpy(np.full(len(triangles), 3, np.int32)))
+        ground.CreateSubdivisionSchemeAttr("none")
+        self._finish_shape(ground, Organ.GROUND, [tuple(points.min(0)), tuple(points.max(0))])
+        pxr.UsdPhysics.MeshCollisionAPI.Apply(ground.GetPrim()).CreateApproximationAttr("none")
+
     def _finish_shape(self, shape: Any, organ: Organ, extent: list[tuple], *, collides: bool = True) -> None:
         shape.CreateDisplayColorAttr([self._vector(np.array(COLORS[organ][:3]))])
         shape.CreateExtentAttr([self._vector(np.array(corner)) for corner in extent])
@@ -224,3 +240,16 @@ class _StageWriter:
     def _turn(self, q: np.ndarray) -> Any:
         x, y, z, w = map(float, q)
         return self._pxr.Gf.Quatf(w, x, y, z)
+
+
+def _ground_mesh(terrain: Terrain) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the nodes [node, 3] m of the uneven ground, and the corners [triangle, 3] of its triangles,
+    counterclockwise from above."""
+    heights = terrain.nodes()
+    rows, columns = heights.shape
+    x = np.broadcast_to(terrain.origin[0] + terrain.cell * np.arange(columns), heights.shape)
+    y = np.broadcast_to(terrain.origin[1] + terrain.cell * np.arange(rows)[:, None], heights.shape)
+    low = (columns * np.arange(rows - 1)[:, None] + np.arange(columns - 1)).ravel()
+    high = low + columns + 1
+    triangles = np.concatenate([np.stack([low, low + 1, high], -1), np.stack([low, high, high - 1], -1)])
+    return np.stack([x, y, heights], -1).reshape(-1, 3), triangles

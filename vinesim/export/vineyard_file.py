@@ -61,6 +61,10 @@ def write_vineyard(
         parameters: gravity and friction.
     """
     write, orthogonal = FORMATS[file.suffix.lower()]
+    if model.terrain is not None and file.suffix.lower() == ".urdf":
+        raise UsageError(
+            f"{file}: a URDF has no uneven ground, which this scene has; write MJCF (.xml) or OpenUSD (.usd)"
+        )
     vineyard = describe(
         model,
         name=name,

@@ -286,7 +286,7 @@ class VineyardRenderer:
             if actors and attempt < _TRIES_WITH_ACTORS:  # look from the side opposite to an actor
                 behind = np.array(actors[rng.integers(len(actors))]) - middle[:2]
                 around = np.arctan2(-behind[1], -behind[0]) + rng.normal(0.0, 0.3)
-            height += float(ground_height(model.terrain, *middle[:2]))
+            height += float(ground_height(self.model.terrain, *middle[:2]))
             rise = height - middle[2]
             level = np.sqrt(max(away**2 - rise**2, rise**2))  # never steeper than 45 degrees
             eye = np.array([*(middle[:2] + level * np.array([np.cos(around), np.sin(around)])), height])
