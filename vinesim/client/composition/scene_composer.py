@@ -84,10 +84,15 @@ class CratePlacement:
     size: tuple[float, float, float] = (0.6, 0.4, 0.24)
     """Outer length, width, height [m]."""
 
-    def pose(self, terrain: Terrain | None) -> np.ndarray:
-        """Returns the pose [7] of the crate in the world."""
+    @property
+    def pose(self) -> np.ndarray:
+        """Pose [7] of the crate on level ground."""
+        return _ground_pose(None, self.x, self.y, self.yaw)
+
+    def pose_on(self, terrain: Terrain | None) -> np.ndarray:
+        """Returns the pose [7] of the crate on the ground."""
         if terrain is None:
-            return _ground_pose(None, self.x, self.y, self.yaw)
+            return self.pose
         return terrain.resting_pose(self.x, self.y, self.yaw, (0.5 * self.size[0], 0.5 * self.size[1]))
 
 
@@ -119,7 +124,7 @@ class SceneComposer:
     def with_crates(self, model: Model) -> Model:
         """Returns the model with the crates added after its own boxes."""
         count = len(self.crates)
-        pose = np.array([c.pose(model.terrain) for c in self.crates])
+        pose = np.array([c.pose_on(model.terrain) for c in self.crates])
         size = np.array([c.size for c in self.crates])
         return dataclasses.replace(
             model,
@@ -175,7 +180,7 @@ def fill_crate(physics: Physics, number: int, crate: CratePlacement) -> list[int
     """Let the bunches nearest to a crate fall into it until its ``fill`` is reached. Returns their indices."""
     model = physics.model
     rigid = physics.rigid
-    pose = crate.pose(model.terrain)
+    pose = crate.pose_on(model.terrain)
     inside = np.array(crate.size) - [2.0 * CRATE_WALL, 2.0 * CRATE_WALL, CRATE_WALL]
     wanted = crate.fill * HEAP_DENSITY * float(np.prod(inside))
     where = physics.state.body_q[model.bunch_body, :3]
