@@ -111,8 +111,10 @@ def test_another_controller_manager_moves_the_robot_by_its_own_gains(client, mon
         assert list(system.state.name) == list(robot.description.joints)
         wait_until(lambda: abs(system.of("position", EFFORT) - GOAL) < 0.01, step, "the node's own gains at the goal")
         wait_until(
-            lambda: max(abs(system.of("position", joint) - goal) for joint, goal in zip(ARM, system.arm, strict=True))
-            < 0.01,
+            lambda: (
+                max(abs(system.of("position", joint) - goal) for joint, goal in zip(ARM, system.arm, strict=True))
+                < 0.01
+            ),
             step,
             "the positions",
         )
