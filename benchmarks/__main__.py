@@ -138,6 +138,11 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
             "seed": {"type": int, "default": 1, "help": "seed of the moments"},
         },
     ),
+    "robot_files": (
+        _later("robot_files:robot_files"),
+        "load, stand and visibility of all robot files below folders",
+        {"folders": {"nargs": "+", "metavar": "FOLDER", "help": "folder with robot files, or one file"}},
+    ),
     "soak": (
         _soak,
         "memory, threads and open files in a long run (Linux)",
@@ -160,7 +165,7 @@ def _parser() -> argparse.ArgumentParser:
         command = commands.add_parser(name, help=text, description=text)
         command.add_argument("--json", action="store_true", help="print one JSON object a line")
         for option, settings in options.items():
-            command.add_argument(f"--{option}", **settings)
+            command.add_argument(option if "nargs" in settings else f"--{option}", **settings)
     return parser
 
 

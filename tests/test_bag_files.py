@@ -114,6 +114,22 @@ def test_of_a_cut_file_all_that_is_whole_is_read(tmp_path, packing, chunk):
     assert counts[0] < 20 < 180 < counts[-1]
 
 
+def test_a_whole_file_is_read_by_its_index_and_damage_ends_it(tmp_path):
+    """By the index a topic is read without the rest of the file, and messages in the order of their times."""
+    rows = messages(200)
+    file = tmp_path / "run.mcap"
+    write_mcap(file, rows[100:] + rows[:100], packing=CompressionType.NONE)
+    assert list(open_bag(file).messages()) == rows
+    data = bytearray(file.read_bytes())
+    data[data.index(b"message 150")] ^= 0x55
+    file.write_bytes(data)
+    bag = open_bag(file)
+    read = list(bag.messages())
+    assert 0 < len(read) < 200
+    assert read == rows[: len(read)]
+    assert bag.damage.startswith(f"{file}: is damaged after message {len(read)} (")
+
+
 def test_a_cut_file_of_a_folder_does_not_hide_the_next_one(tmp_path):
     for number in range(2):
         write_mcap(tmp_path / f"run_{number}.mcap", messages(20, 20 * number), chunk=0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+import sys
 
 import pytest
 
@@ -42,3 +43,18 @@ def test_elsewhere_a_line_is_written_every_few_seconds(monkeypatch: pytest.Monke
         now += 1.0
     say(handler, "")
     assert stream.getvalue() == "vinesim: compiling: 0\nvinesim: compiling: 5\n"
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_progress_is_shown_on_standard_error_unless_the_program_logs_it(
+    own: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As in programs that use the Python interface, which have set up no output of their own."""
+    monkeypatch.setattr(progress.log, "handlers", [logging.StreamHandler(sys.stdout)] if own else [])
+    monkeypatch.setattr(progress.log, "propagate", False)
+    monkeypatch.setattr(progress.log, "level", logging.INFO)
+    progress.show_by_default()
+    progress.log.info("compiling kernels, only once: 1 of 31 done")
+    said = capsys.readouterr()
+    assert said.out == ("compiling kernels, only once: 1 of 31 done\n" if own else "")
+    assert said.err == ("" if own else "vinesim: compiling kernels, only once: 1 of 31 done\n")

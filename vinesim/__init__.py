@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from vinesim.api.client import Client as Client
     from vinesim.api.energy import Energy as Energy
     from vinesim.api.energy import Momentum as Momentum
+    from vinesim.api.export import export_vineyard as export_vineyard
     from vinesim.api.page import Page as Page
     from vinesim.api.picking import Grasp as Grasp
     from vinesim.api.picking import PickAttempt as PickAttempt
@@ -74,6 +75,7 @@ _MODULES = {
     "assemble": "scene.cane",
     "attempt_pick": "api.picking",
     "cane": "scene.cane",
+    "export_vineyard": "api.export",
     "frames": "core.frames",
     "generate": "scene.generation.vineyard",
     "import_plant": "scene.plant_import.imported_plant",
@@ -110,6 +112,7 @@ __all__ = [
     "assemble",
     "attempt_pick",
     "cane",
+    "export_vineyard",
     "frames",
     "generate",
     "import_plant",

@@ -42,10 +42,10 @@ class Localiser(Node):
             self.asking.cancel()
 
     def restore(self) -> None:
-        """Ask the robot to publish its true pose again, and wait for the answer for at most a second."""
+        """Ask the robot to publish its true pose again, and wait for the answer for at most half a second."""
         if self.asking.is_canceled():
             answer = self.settings.set_parameters([Parameter("publish_map_to_odom", value=True)])
-            rclpy.spin_until_future_complete(self, answer, timeout_sec=1.0)
+            rclpy.spin_until_future_complete(self, answer, timeout_sec=0.5)
 
     def report(self) -> None:
         if self.last is None:

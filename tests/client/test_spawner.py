@@ -221,6 +221,17 @@ def test_a_robot_name_from_the_network_is_not_a_path(vinebot, tmp_path, monkeypa
     assert list(tmp_path.rglob("*")) == []
 
 
+def test_a_robot_name_from_the_network_opens_no_pipe_and_no_file_of_the_folder(vinebot, tmp_path, monkeypatch):
+    """``-`` means the standard input for ``--robot`` only, and ``other.urdf`` may be a file of the user."""
+    (tmp_path / "other.urdf").write_text(vinebot.urdf)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("vinesim.client.remote.spawner.load_description", lambda file, **options: (file, options))
+    for name in ("-", "other.urdf"):
+        file, options = resolve_description(hello(vinebot, urdf="<robot/>", robot=name), vinebot)
+        assert options["is_remote"]
+        assert file.parent != tmp_path
+
+
 def test_a_robot_of_another_client_has_the_gains_that_its_sender_gave_it(vinebot):
     """The sender's TOML file does not exist here: groups, gains and limits come with the hello."""
     stiffer = {

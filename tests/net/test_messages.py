@@ -396,6 +396,19 @@ def test_objects_are_decoded_within_quantisation(seed, count, where, speed):
         assert (np.abs(received.velocity - sent.velocity)[:, part].max(1) <= np.maximum(fastest / 126.0, least)).all()
 
 
+@pytest.mark.parametrize("height", [-60.0, -4.0, -0.6, 5.6, 7.0, 12.3, 126.0])
+def test_objects_on_a_slope_are_decoded_within_quantisation(height):
+    sent = objects(np.random.default_rng(3), 20)
+    sent.pose[:, 2] = height + np.linspace(0.0, 0.05, 20)
+    payloads, received = encode_objects(sent, (0, 0))
+    assert np.abs(received.pose[:, :3] - sent.pose[:, :3]).max() <= 0.5e-4 + 1e-9
+    np.testing.assert_array_equal(received.flags, sent.flags)
+    decoded = [decode_objects(payload, (0, 0)) for payload in payloads]
+    assert np.concatenate([part.pose for part in decoded]).tobytes() == received.pose.tobytes()
+    flags = np.frombuffer(payloads[0], np.uint8)[HEADER.size + 8 :: 26]
+    assert (flags < 4).all() == (-0.7 < height < 5.66), "on level ground the bytes are as ever"
+
+
 @pytest.mark.parametrize(("column", "limit"), [(0, 64.0), (3, 256.0)])
 def test_an_object_at_an_absurd_speed_is_refused_and_never_sent(column, limit):
     """A box that was believed to spin at 16,000 rad/s, as the format could say, made MuJoCo unstable where it hit."""

@@ -18,7 +18,7 @@ from vinesim.core import frames
 from vinesim.net.codec.robot import decode_robot, encode_robot
 from vinesim.rigid.urdf import shapes_of
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.description.meshes import find_installed
+from vinesim.robot.description.packages import find_installed
 from vinesim.robot.description.urdf import DescriptionError
 
 MOMENTS = 'ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"'

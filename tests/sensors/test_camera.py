@@ -12,11 +12,13 @@ from vinesim.core import frames
 from vinesim.core.data_files import find_data_file
 from vinesim.scene.camera_geometry import measured_points, project_points
 from vinesim.scene.ids import Organ, label
+from vinesim.scene.values import CameraMount
 from vinesim.sensors import ground_truth
-from vinesim.sensors.camera.camera import Camera, CameraSpec
+from vinesim.sensors.camera.camera import MAKER, Camera, CameraSpec
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
 from vinesim.sensors.raster.camera_rasterizer import pinhole
+from vinesim.sensors.sensor import SensorSetting
 from vinesim.sensors.spec_file import SensorError
 
 SUN = (0.4, 0.5, 0.77)
@@ -232,3 +234,21 @@ def test_a_still_has_soft_edges() -> None:
         between.append(((share > 0.15) & (share < 0.85)).mean())
     assert between[0] < 0.25  # the tree line behind has edges of its own
     assert between[1] > 1.5 * between[0]
+
+
+def test_a_mount_gives_angle_range_and_noise_of_its_own() -> None:
+    mount = CameraMount(
+        "eye", "optical", "pinhole", size=(320, 200), field_of_view=1.2, range=(0.1, 1.5), noise=0.05, quality="full"
+    )
+    made = MAKER.make(mount, SensorSetting())
+    assert (made.info.width, made.info.height) == (320, 200)
+    assert 2.0 * np.arctan(160.0 / made.info.fx) == pytest.approx(1.2)
+    wall = sensor_scenes.shape("box", 0.05, 3.0, 3.0, at=(2.0, 0.0, 1.0))
+    primitives, view = sensor_scenes.world(sensor_scenes.thing(wall))
+    exact = MAKER.make(msgspec.structs.replace(mount, noise=0.0), SensorSetting())
+    noisy, clean = (one.render(primitives, sensor_scenes.AHEAD, view.time) for one in (made, exact))
+    assert np.isposinf(noisy.depth[noisy.labels == label(Organ.ROBOT, 0)]).all()
+    inside = (clean.rgb > 60) & (clean.rgb < 195)  # where nothing is clipped
+    error = (noisy.rgb.astype(float) - clean.rgb)[inside]
+    assert error.size > 10_000
+    assert error.std() == pytest.approx(0.05 * 255.0, rel=0.05)

@@ -19,16 +19,19 @@ import numpy as np
 import pytest
 from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
+from pycocotools.cocoeval import COCOeval
 
 from tests.support import programs
 from tests.support.waiting import deadline
 from vinesim.cli.dataset import _progress
+from vinesim.cli.dataset import run as run_dataset
 from vinesim.cli.render import run as render
 from vinesim.client.composition.domain_randomizer import SceneRandomizer
 from vinesim.client.composition.scene_composer import PlacementError
 from vinesim.core import progress
 from vinesim.core.data_files import DataFileNotFound
 from vinesim.core.errors import UsageError, WriteError
+from vinesim.core.version import __version__
 from vinesim.robot.description.urdf import DescriptionError
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.spec import load_scene
@@ -163,12 +166,199 @@ def test_pycocotools_reads_it(whole: pathlib.Path, capsys: pytest.CaptureFixture
         mask = read.annToMask(one).astype(bool)
         assert np.array_equal(mask, ids == label(Organ.BUNCH, one["bunch"]))
         assert one["area"] == mask.sum() >= annotations.MIN_ANNOTATED_PIXELS
-        assert one["bbox"] == coco_mask.toBbox(one["segmentation"]).tolist()
+        assert one["bbox"] == coco_mask.toBbox(read.annToRLE(one)).tolist()
         amodal = coco_mask.decode(one["amodal_segmentation"]).astype(bool)
         assert not (mask & ~amodal).any()
         assert one["occlusion"] == pytest.approx(1.0 - mask.sum() / amodal.sum())
         assert one["amodal_bbox"] == coco_mask.toBbox(one["amodal_segmentation"]).tolist()
         assert len(one["keypoints"]) == 3 * len(read.cats[one["category_id"]]["keypoints"])
+
+
+def test_coco_evaluation_of_the_truth_itself_finds_all(whole: pathlib.Path) -> None:
+    truth = COCO(str(whole / "annotations.json"))
+    names = ("image_id", "category_id", "bbox", "segmentation")
+    found = truth.loadRes([{name: one[name] for name in names} | {"score": 0.9} for one in truth.anns.values()])
+    for kind in ("bbox", "segm"):
+        judge = COCOeval(truth, found, kind)
+        judge.evaluate()
+        judge.accumulate()
+        judge.summarize()
+        assert judge.stats[0] == pytest.approx(1.0)
+
+
+@pytest.fixture
+def copy(whole: pathlib.Path, tmp_path: pathlib.Path) -> pathlib.Path:
+    """A copy of the data set, to be changed."""
+    shutil.copytree(whole, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+@pytest.mark.parametrize("form", annotations.SEGMENTATIONS)
+def test_masks_in_every_form_are_those_of_the_ids(copy: pathlib.Path, form: str) -> None:
+    """By the calls of torchvision's references and of DETR, which do not take compressed run lengths."""
+    dataset.finish(copy, IMAGES, form)
+    said = json.loads((copy / "annotations.json").read_text())
+    shapes = {one["id"]: (one["height"], one["width"]) for one in said["images"]}
+    for one in said["annotations"]:
+        mask = one["segmentation"]
+        if form != "compressed":
+            mask = coco_mask.frPyObjects(mask, *shapes[one["image_id"]])
+        pixels = coco_mask.decode(mask)
+        pixels = pixels.any(axis=2) if pixels.ndim == 3 else pixels.astype(bool)
+        ids = _ids(copy / "ids" / f"{one['image_id']:06d}.png")
+        assert np.array_equal(pixels, ids == label(Organ.BUNCH, one["bunch"]))
+
+
+@pytest.mark.parametrize("form", annotations.SEGMENTATIONS)
+def test_supervision_reads_masks_of_every_form(copy: pathlib.Path, form: str) -> None:
+    """It fills polygons with their boundary, which adds up to a pixel to the right and below; run lengths are exact."""
+    supervision = pytest.importorskip("supervision", reason="supervision is no dependency of vinesim")
+    dataset.finish(copy, IMAGES, form)
+    read = supervision.DetectionDataset.from_coco(str(copy), str(copy / "annotations.json"), force_masks=True)
+    assert read.classes == ["bunch"]
+    annotated = json.loads((copy / "annotations.json").read_text())["annotations"]
+    assert len(read) == IMAGES
+    for path, _, found in read:
+        image = int(pathlib.Path(path).stem)
+        ids = _ids(copy / "ids" / f"{image:06d}.png")
+        bunches = [one["bunch"] for one in annotated if one["image_id"] == image]
+        assert found.class_id.tolist() == [0] * len(bunches)
+        for mask, bunch in zip(found.mask, bunches, strict=True):
+            truth = ids == label(Organ.BUNCH, bunch)
+            most = cv2.dilate(truth.astype(np.uint8), np.ones((2, 2)), anchor=(1, 1)).astype(bool)
+            assert not (truth & ~mask).any()
+            assert not (mask & ~(most if form == "polygons" else truth)).any()
+
+
+def test_coco_file_names_version_seed_and_licence_but_no_date(whole: pathlib.Path, copy: pathlib.Path) -> None:
+    said = json.loads((copy / "annotations.json").read_text())
+    assert said["info"]["version"] == __version__
+    assert said["info"]["seed"] == 5
+    assert not {"year", "date_created"} & said["info"].keys()
+    assert {one["license"] for one in said["images"]} == {one["id"] for one in said["licenses"]}
+    assert all(one["supercategory"] for one in said["categories"])
+    dataset.finish(copy, IMAGES)
+    assert _files(copy) == _files(whole)
+
+
+def test_yolo_segments_are_the_masks(copy: pathlib.Path) -> None:
+    dataset.finish(copy, IMAGES, yolo="segment")
+    for record in (json.loads(p.read_text()) for p in sorted((copy / "records").glob("*.json"))):
+        ids = _ids(copy / "ids" / f"{record['image']:06d}.png")
+        lines = (copy / "labels" / f"{record['image']:06d}.txt").read_text().splitlines()
+        large = [b for b in record["bunches"] if b["pixels"] >= annotations.MIN_ANNOTATED_PIXELS]
+        for line, one in zip(lines, large, strict=True):
+            words = line.split()
+            assert words[0] == "0"
+            shares = np.array(words[1:], float)
+            assert len(shares) % 2 == 0
+            assert len(shares) >= 6
+            assert ((shares >= 0.0) & (shares <= 1.0)).all()
+            polygon = shares.reshape(-1, 2) * [160, 120]
+            assert np.abs(polygon - polygon.round()).max() < 1e-3  # corners of pixels
+            pixels = coco_mask.decode(coco_mask.frPyObjects([polygon.ravel().tolist()], 120, 160))[..., 0]
+            assert np.array_equal(pixels.astype(bool), ids == one["label"])
+            low, high = polygon.min(0), polygon.max(0)  # Ultralytics makes the box of a segment so
+            assert [*low, *(high - low)] == pytest.approx(one["box"], abs=1e-3)
+
+
+def test_yolo_poses_are_boxes_and_cut_points(whole: pathlib.Path, copy: pathlib.Path) -> None:
+    dataset.finish(copy, IMAGES, yolo="pose")
+    settings = (copy / "data.yaml").read_text()
+    assert "kpt_shape: [1, 3]\n" in settings
+    assert "flip_idx: [0]\n" in settings
+    shown = set()
+    annotated = json.loads((copy / "annotations.json").read_text())["annotations"]
+    for image in range(IMAGES):
+        lines = (copy / "labels" / f"{image:06d}.txt").read_text().splitlines()
+        boxes = (whole / "labels" / f"{image:06d}.txt").read_text().splitlines()
+        points = [one["keypoints"] for one in annotated if one["image_id"] == image]
+        for line, box, (column, row, seen) in zip(lines, boxes, points, strict=True):
+            words = line.split()
+            assert words[:5] == box.split()
+            assert len(words) == 8
+            values = np.array(words[1:7], float)
+            assert ((values >= 0.0) & (values <= 1.0)).all()
+            assert int(words[7]) == seen
+            if seen:  # a middle of a pixel is at half a pixel in shares
+                assert values[4:] * [160, 120] == pytest.approx([column + 0.5, row + 0.5], abs=1e-3)
+            else:
+                assert not values[4:].any()
+            shown.add(seen)
+    assert len(shown) > 1
+
+
+def test_a_share_of_the_images_shows_no_bunch_and_the_others_stay(
+    scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    plan = DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE, negatives=0.5)
+    assert np.mean([plan.is_negative(image) for image in range(4000)]) == pytest.approx(0.5, abs=0.03)
+    dataset.prepare_folder(plan, tmp_path, IMAGES)
+    list(dataset.render_images(plan, tmp_path, range(IMAGES)))
+    dataset.finish(tmp_path, IMAGES)
+    negatives = [image for image in range(IMAGES) if plan.is_negative(image)]
+    assert 0 < len(negatives) < IMAGES
+    annotated = json.loads((tmp_path / "annotations.json").read_text())
+    assert len(annotated["images"]) == IMAGES
+    assert {one["image_id"] for one in annotated["annotations"]} == set(range(IMAGES)) - set(negatives)
+    files, others = _files(tmp_path), _files(whole)
+    for image in range(IMAGES):
+        organs = _ids(tmp_path / "ids" / f"{image:06d}.png") >> 20
+        assert (organs == Organ.BUNCH).any() == (image not in negatives)
+        if image in negatives:
+            assert files[f"labels/{image:06d}.txt"] == b""
+            assert np.isin(organs, [Organ.TRUNK, Organ.ARM, Organ.CANE, Organ.LEAF]).mean() >= dataset.MIN_PLANT_SHARE
+        else:
+            assert all(data == others[name] for name, data in files.items() if f"{image:06d}" in name)
+    with pytest.raises(DatasetError, match=r"begun with negatives 0.5, not 0.0"):
+        dataset.prepare_folder(DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE), tmp_path, IMAGES)
+
+
+def test_semantic_images_have_the_classes_of_the_ids(
+    scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    plan = DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE, semantic=True)
+    dataset.prepare_folder(plan, tmp_path, IMAGES)
+    list(dataset.render_images(plan, tmp_path, range(IMAGES)))
+    assert dataset.missing_images(tmp_path, IMAGES) == []
+    names = json.loads((tmp_path / "dataset.json").read_text())["semantic"]
+    organs_of = {
+        "sky": Organ.NOTHING,
+        "soil": Organ.GROUND,
+        "grass": Organ.GROUND,
+        "post": Organ.POLE,
+        "berry": Organ.BUNCH,
+        "person": Organ.HUMAN,
+    }
+    shown = set()
+    for image in range(IMAGES):
+        classes = cv2.imread(str(tmp_path / "semantic" / f"{image:06d}.png"), cv2.IMREAD_UNCHANGED)
+        assert classes.dtype == np.uint8
+        organs = _ids(tmp_path / "ids" / f"{image:06d}.png") >> 20
+        assert classes.shape == organs.shape
+        for value in np.unique(classes):
+            name = names[str(value)]
+            organ = organs_of[name] if name in organs_of else Organ[name.upper()]
+            assert (organs[classes == value] == organ).all()
+            shown.add(name)
+        berry = cv2.imread(str(tmp_path / "berries" / f"{image:06d}.png"), cv2.IMREAD_UNCHANGED)
+        assert np.array_equal(classes == annotations.SEMANTIC_CLASSES.index("berry"), berry > 0)
+    assert {"sky", "soil", "grass", "leaf", "cane", "bunch", "berry"} <= shown
+    files = {name: data for name, data in _files(whole).items() if name.endswith(".png")}
+    assert {name: _files(tmp_path)[name] for name in files} == files
+    (tmp_path / "semantic" / "000002.png").unlink()
+    assert dataset.missing_images(tmp_path, IMAGES) == [2]
+
+
+def test_unknown_forms_are_refused_in_one_line(scene: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    given = {"images": 1, "out": tmp_path / "set", "scene": str(scene), "seed": 5, "camera": "d435", "size": None}
+    given |= {"workers": 1, "actors": 0.0, "device": "cpu"}
+    for option, words in (("segmentation", "polygons, rle or compressed"), ("yolo", "detect, segment or pose")):
+        with pytest.raises(UsageError, match=f"--{option} is 'coco': give {words}"):
+            run_dataset(**given, **{option: "coco"})
+    with pytest.raises(UsageError, match=r"--negatives is 1.5: give a share of the images, 0 to 1"):
+        run_dataset(**given, negatives=1.5)
+    assert not (tmp_path / "set").exists()
 
 
 def _ids(file: pathlib.Path) -> np.ndarray:
@@ -243,7 +433,7 @@ def test_an_image_is_the_same_whatever_was_drawn_before(
     last = dataset.IMAGES_PER_VINEYARD - 1
     list(dataset.render_images(plan, tmp_path, [last]))
     alone = {name: data for name, data in _files(tmp_path).items() if f"{last:06d}" in name}
-    assert len(alone) == 7
+    assert len(alone) == 6
     assert alone == {name: _files(whole)[name] for name in alone}
 
 
@@ -316,16 +506,16 @@ def test_a_failing_disk_leaves_the_image_before_whole_and_the_same_command_goes_
     (out / "images" / "000001.png").unlink()
     before = _files(out)
     with pytest.MonkeyPatch.context() as patch:
-        _full_disk(patch, "000001.txt", error)
+        _full_disk(patch, "000001.json", error)
         with pytest.raises(WriteError, match=f"image 1 .*{os.strerror(error)}; make room .* goes on") as said:
             list(dataset.render_images(plan, out, dataset.missing_images(out, IMAGES)))
     assert "\n" not in str(said.value)
     assert said.value.exit_code == 5
     assert _files(out) == before
-    for name in ("annotations.json", "val.txt", "data.yaml"):
+    for name in ("annotations.json", "000001.txt", "val.txt", "data.yaml"):
         with pytest.MonkeyPatch.context() as patch:
             _full_disk(patch, name, error)
-            with pytest.raises(WriteError, match=r"annotations\.json and the lists"):
+            with pytest.raises(WriteError, match=r"annotations\.json, the labels and the lists"):
                 dataset.finish(out, IMAGES)
         assert _files(out) == before
     assert list(dataset.render_images(plan, out, dataset.missing_images(out, IMAGES))) == [1]
@@ -359,7 +549,7 @@ def _empty(file: pathlib.Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [_truncate, _empty, pathlib.Path.unlink])
-@pytest.mark.parametrize("kind", ["images", "labels", "depth", "measured", "ids", "berries", "records"])
+@pytest.mark.parametrize("kind", ["images", "depth", "measured", "ids", "berries", "records"])
 def test_a_damaged_file_makes_its_image_missing(whole: pathlib.Path, tmp_path: pathlib.Path, kind: str, damage) -> None:
     out = tmp_path / "set"
     shutil.copytree(whole, out)

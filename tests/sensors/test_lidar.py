@@ -9,8 +9,10 @@ from vinesim.core import frames
 from vinesim.core.data_files import find_data_file
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
-from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
+from vinesim.scene.values import LidarMount
+from vinesim.sensors.lidar.lidar import MAKER, Lidar, LidarSpec
 from vinesim.sensors.primitives.scene_primitives import Primitives
+from vinesim.sensors.sensor import SensorSetting
 from vinesim.sensors.spec_file import SensorError
 
 AT = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0])
@@ -363,3 +365,31 @@ def test_any_number_of_threads_gives_the_same_scan() -> None:
         parts = lidar.finish_revolution(AT, 0.0)
         assert np.array_equal(whole.xyz, parts.xyz)
         assert np.array_equal(whole.labels, parts.labels)
+
+
+def test_a_mount_gives_angles_ranges_and_noise_of_its_own() -> None:
+    """Before a wall at 5 m: the given lasers, shots and noise, and nothing beyond the given sector and range."""
+    mount = LidarMount(
+        "scan",
+        "lidar",
+        "vlp16",
+        rate=5.0,
+        columns=720,
+        elevations=(-0.01, 0.0, 0.01),
+        sector=(-1.0, 0.5),
+        range=(0.2, 6.0),
+        noise=0.02,
+    )
+    made = MAKER.make(mount, SensorSetting())
+    assert made.rate == 5.0
+    wall = sensor_scenes.shape("box", 0.1, 50.0, 50.0, at=(5.1, 0.0, 0.0))
+    scan = made.scan(sensor_scenes.world(sensor_scenes.thing(wall))[0], AT)
+    azimuth = np.arctan2(scan.xyz[:, 1], scan.xyz[:, 0])
+    assert -1.0 <= azimuth.min() < -0.5  # beyond 0.59 rad the wall is farther away than 6 m
+    assert 0.45 < azimuth.max() <= 0.5
+    distance = np.linalg.norm(scan.xyz, axis=1)
+    assert distance.max() < 6.1
+    assert set(scan.ring) == {0, 1, 2}
+    assert len(azimuth) == pytest.approx(3 * 720 * (0.59 + 0.5) / (2.0 * np.pi), rel=0.02)
+    level = scan.ring == 1
+    assert (distance[level] - 5.0 / np.cos(azimuth[level])).std() == pytest.approx(0.02, rel=0.2)

@@ -37,11 +37,13 @@ class Installation:
         # the wheel's package comes first; addsitedir also runs the start-up files of the wheels of ROS
         theirs = pathlib.Path(sysconfig.get_path("purelib"))
         (packages / "others.pth").write_text(f"import site; site.addsitedir({str(theirs)!r})\n")
-        # the wheels of ROS look for their libraries below sys.prefix
-        for library in (*theirs.glob("ros_*.libs"), *theirs.parents[1].glob("*.so*"), *theirs.parents[2].glob("share")):
-            place = packages if library.parent == theirs else folder / library.parent.relative_to(theirs.parents[2])
-            if not (place / library.name).exists():
-                (place / library.name).symlink_to(library)
+        # the wheels of ROS look for their libraries below sys.prefix, and a build of message packages for headers
+        prefix = theirs.parents[2]
+        needed = [*theirs.glob("ros_*.libs"), *theirs.parents[1].glob("*.so*"), prefix / "share"]
+        for part in (*needed, *prefix.glob("include/*")):
+            place = packages if part.parent == theirs else folder / part.parent.relative_to(prefix)
+            if not (place / part.name).exists():
+                (place / part.name).symlink_to(part)
         options = ["--quiet", "--disable-pip-version-check", "--no-deps", "--no-index", "--ignore-installed"]
         command = [python, "-m", "pip", "install", *options, str(wheel)]
         done = subprocess.run(command, capture_output=True, text=True, check=False, env=self.environment())

@@ -5,6 +5,8 @@ from __future__ import annotations
 import pathlib
 import re
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 
 import msgspec
@@ -37,6 +39,22 @@ def _filmed(path: pathlib.Path) -> None:
     filmed.write_bag(path, swing.time, pictures)
 
 
+def _filmed_cane(path: pathlib.Path) -> None:
+    """Pictures of a cane without markers, as a ROS recording."""
+    from tests.tune import test_cane_track as filmed
+    from tests.tune.test_track_command import write_bag
+
+    time = np.arange(24) / 30.0
+    pictures = [filmed.picture(t, 0.25 * np.cos(9.0 * t / time[-1])) for t in time]
+    write_bag(path, time, [(one.rgb, one.depth) for one in pictures])
+
+
+def _tour(path: pathlib.Path) -> None:
+    """Pictures along a path."""
+    command = ["vinesim", "render", "demo", "--path", str(ROOT / "examples/tour.csv"), "--size", "160x120"]
+    subprocess.run([sys.executable, "-m", *command, "--out", str(path)], check=True, capture_output=True)
+
+
 def _certificate(folder: pathlib.Path) -> None:
     """What an administrator hands to an actor of that name."""
     folder.mkdir()
@@ -49,6 +67,9 @@ MAKERS: dict[str, Callable[[pathlib.Path], object]] = {
     "filmed.csv": _track,
     "scan.xyz": _scan,
     "pull.mcap": _filmed,
+    "cane.mcap": _filmed_cane,
+    "tour": _tour,
+    "vine.ply": lambda path: shutil.copy(ROOT / "examples/plants/vine.ply", path),
     "run.mcap": record_a_pick,
     "vine.mtg": lambda path: shutil.copy(ROOT / "examples/plants/vine.mtg", path),
     "my.urdf": lambda path: shutil.copy(ROOT / "data/robots/vinebot.urdf", path),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from xml.etree import ElementTree
 
 import numpy as np
@@ -11,13 +12,16 @@ from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.builder import assemble
+from vinesim.scene.terrain import Terrain
 
 
 class Yard:
     """One robot on bare ground, and a clock."""
 
-    def __init__(self, description: RobotDescription, pose: np.ndarray | None = None) -> None:
-        self.rigid = RigidWorld(assemble([]))
+    def __init__(
+        self, description: RobotDescription, pose: np.ndarray | None = None, terrain: Terrain | None = None
+    ) -> None:
+        self.rigid = RigidWorld(dataclasses.replace(assemble([]), terrain=terrain))
         self.robot = Robot(self.rigid, description, "anna", pose=pose)
         self.time = 0.0
 

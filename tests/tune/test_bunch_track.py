@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from tests.support.tuning import bunch
+from tests.tune.test_track_command import write_bag
+from vinesim.cli.tune import track
 from vinesim.scene.values import CameraFrame, CameraInfo
-from vinesim.tune import TrajectoryError, track_bunch
+from vinesim.tune import TrajectoryError, read_trajectory, track_bunch
+from vinesim.tune.fit import specimen_toml
 from vinesim.tune.specimen import place_markers
 
 INFO = CameraInfo(240, 240, 300.0, 300.0, 119.5, 80.0, "optical")
@@ -54,3 +57,19 @@ def test_a_bunch_that_is_not_in_sight_is_one_clear_line() -> None:
     pictures = [picture(i / 30.0, 0.1) for i in range(12)]
     with pytest.raises(TrajectoryError, match="none of 12 pictures shows a whole bunch that hangs from a clamp at"):
         track_bunch(pictures, bunch(), base=BASE + np.array([0.0, 3.0, 0.0]))
+
+
+def test_a_recording_of_a_bunch_becomes_a_track_by_the_command_of_the_page(tmp_path, capsys) -> None:
+    """``vinesim track swing.mcap --bunch examples/bunch.toml --base``, as in docs/tuning.md."""
+    time = np.arange(24) / 30.0
+    angles = 0.2 * np.cos(np.linspace(0.0, 9.0, 24))
+    drawn = [picture(t, a) for t, a in zip(time, angles, strict=True)]
+    write_bag(tmp_path / "swing.mcap", time, [(one.rgb, one.depth) for one in drawn], camera=INFO)
+    (tmp_path / "bunch.toml").write_text(specimen_toml(bunch()))
+    files = tmp_path / "swing.mcap", [], None, tmp_path / "filmed.csv"
+    plant = {"base": (0.0, 0.5, 0.0), "bunch": tmp_path / "bunch.toml"}
+    assert track(*files, None, None, None, None, **plant) == 0
+    assert "mm   found in 24, the others are gaps" in capsys.readouterr().out
+    found = read_trajectory(tmp_path / "filmed.csv")
+    true = BASE + BELOW * np.stack([np.sin(angles), np.zeros(24), -np.cos(angles)], -1)
+    assert 1e3 * np.std(found.position[:, 0, 0] - true[:, 0]) < 0.3

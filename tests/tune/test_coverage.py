@@ -13,9 +13,9 @@ from tests.support.tuning import bunch, cane
 from vinesim.bench.tuning import recover
 from vinesim.bench.tuning_cases import draw_bunch, draw_case
 from vinesim.cli.tune import plan, run
-from vinesim.tune import Experiment, hidden_specimen, measure, tune
+from vinesim.tune import Experiment, hidden_specimen, load_specimen, measure, tune
 from vinesim.tune.features import robust_deviation
-from vinesim.tune.fit import specimen_toml
+from vinesim.tune.fit import Comparison, specimen_toml
 from vinesim.tune.posterior import laplace
 from vinesim.tune.priors import Prior
 from vinesim.tune.problem import Evaluation
@@ -123,5 +123,13 @@ def test_a_hidden_truth_differs_from_the_guess_and_is_printed_beside_the_estimat
     assert compared[0]["truth"] == pytest.approx(true.modulus.value)
     for one, line in zip(compared, lines[-2:], strict=True):
         where = "inside" if one["low"] <= one["truth"] <= one["high"] else "outside"
-        assert line.startswith(f"truth    {one['name']} {one['truth']:.4g} ")
-        assert f", {where} the 90 % interval {one['low']:.4g} to {one['high']:.4g}" in line
+        assert line.startswith(f"truth    {one['name']} {one['truth']:#.4g} ")
+        assert f", {where} the 90 % interval {one['low']:#.4g} to {one['high']:#.4g}" in line
+    assert load_specimen(truth).modulus.source == "drawn from seed 0, about 5e+09"
+
+
+def test_a_truth_beside_the_end_of_an_interval_is_printed_with_more_digits() -> None:
+    """Four digits of 1.0112e10, outside of 1.0113e10 to 1.018e10, would be those of the end of the interval."""
+    line = Comparison("modulus", 1.0112e10, 1.0146e10, 1.0113e10, 1.018e10, "Pa").line()
+    assert "modulus 1.0112e+10 Pa" in line
+    assert "outside the 90 % interval 1.0113e+10 to 1.0180e+10" in line

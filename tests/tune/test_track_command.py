@@ -81,9 +81,11 @@ def write_bag(
     millimetres: bool = False,
     without: tuple[str, ...] = (),
     late: float = 0.0,
-    size: tuple[int, int] = (320, 240),
+    size: tuple[int, int] | None = None,
+    camera: CameraInfo = INFO,
 ) -> pathlib.Path:
-    """An MCAP file as rosbag2 writes it, by the stock messages' own serialisation; depth ``late`` [s]."""
+    """An MCAP file as rosbag2 writes it, by the stock messages' own serialisation; depth ``late`` [s]. ``size``: width
+    and height in the camera_info if these differ from the pictures'."""
     pytest.importorskip("rclpy")
     from rclpy.serialization import serialize_message
     from sensor_msgs.msg import CameraInfo as Info
@@ -110,15 +112,18 @@ def write_bag(
                 writer.add_message(channels[topic], now, serialize_message(message), now)
 
         for t, (rgb, depth) in zip(START + time, pictures, strict=True):
-            info = Info(height=size[1], width=size[0], distortion_model="plumb_bob", d=[0.0] * 5)
-            info.k = [INFO.fx, 0.0, INFO.cx, 0.0, INFO.fy, INFO.cy, 0.0, 0.0, 1.0]
+            height, width = depth.shape
+            told = size or (width, height)
+            info = Info(height=told[1], width=told[0], distortion_model="plumb_bob", d=[0.0] * 5)
+            info.k = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
             colours = rgb if encoding == "rgb8" else rgb[..., ::-1]
-            image = Image(height=240, width=320, encoding=encoding, step=960, data=colours.tobytes())
-            far = Image(height=240, width=320, encoding="32FC1", step=1280, data=depth.tobytes())
+            image = Image(height=height, width=width, encoding=encoding, step=3 * width, data=colours.tobytes())
+            far = Image(height=height, width=width, encoding="32FC1", step=4 * width, data=depth.tobytes())
             if millimetres:
                 data = np.round(1e3 * depth).astype("<u2").tobytes()
-                far = Image(height=240, width=320, encoding="16UC1", step=640, data=data)
-            stamp(info, t), stamp(image, t), stamp(far, t + late)
+                far = Image(height=height, width=width, encoding="16UC1", step=2 * width, data=data)
+            for message, when in ((info, t), (image, t), (far, t + late)):
+                stamp(message, when)
             put("color/camera_info", info, t)
             put("color/image_raw", image, t)
             put("depth/image_raw", far, t + 0.05)  # it arrives after the next colours
@@ -245,7 +250,9 @@ def test_times_since_1970_keep_their_microseconds(swing: Trajectory, tmp_path: p
 
 def test_balls_and_a_bare_cane_exclude_each_other(tmp_path) -> None:
     rest = (tmp_path / "track.csv", None, None, None, None)
-    with pytest.raises(UsageError, match="give --marker and --radius of coloured balls, or --cane and --base"):
+    with pytest.raises(
+        UsageError, match="give --marker and --radius of coloured balls, or --cane or --bunch and --base"
+    ):
         track_markers(tmp_path, [], None, *rest)
     with pytest.raises(UsageError, match=r"is followed without balls; give --base X Y Z, and no --marker"):
         track_markers(tmp_path, MARKERS, RADIUS, *rest, tmp_path / "cane.toml", (0.0, 0.9, 0.0))

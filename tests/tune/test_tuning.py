@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import pathlib
+import re
 
 import numpy as np
 import pytest
@@ -77,6 +78,13 @@ def test_a_free_swing_tells_modulus_over_mass_and_the_fit_says_so(track: Traject
     assert ridge.direction["mass"] == pytest.approx(math.sqrt(0.5), abs=0.02)
     assert [e.name for e in fit.estimates if not e.known] == ["modulus", "mass"]
     assert any("force [N]" in line for line in fit.lines())
+    assert any(
+        re.search(r"hardly changes if (mass|modulus) rises and (modulus|mass) rises with", s) for s in fit.lines()
+    )
+    written = fit.fitted_specimen()  # values that swing as the track does, but only the damping is known
+    assert [n.grade for n in (written.modulus, written.density, written.damping)] == ["GUESSED", "GUESSED", "FITTED"]
+    assert "not decided by the track" in written.modulus.source
+    assert written.modulus.value == pytest.approx(fit.estimate("modulus").value, rel=1e-4)
     ratio = fit.posterior.mean[0] - fit.posterior.mean[2]
     assert math.exp(ratio) * 3e9 == pytest.approx(5e9, rel=0.01)  # what can be known is
 
@@ -118,6 +126,37 @@ def test_outliers_and_gaps_hardly_matter(track: Trajectory) -> None:
     assert fit.outliers > fit.left_out + 3
     assert np.isfinite(fit.model[np.isfinite(position[:, 0])]).all()  # also where samples are left out
     assert fit.estimate("modulus").value == pytest.approx(5e9, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"axes": [2, 1, 0]}, "the fitted plant swings at 5"),
+        ({"position": 10.0}, "is the unit right (m, cm, mm)?"),
+        ({"release": 0.5}, "check the unit of the positions, the axes (z is up), the time of the release"),
+    ],
+)
+def test_a_track_that_contradicts_the_fitted_plant_is_a_fault(change: dict, words: str) -> None:
+    """x and z swapped, mm named cm, a late release: each fit was once accepted."""
+    track = measure(cane(1.011e10, 0.00433), Experiment())
+    position = change.get("position", 1.0) * track.position[..., change.get("axes", [0, 1, 2])]
+    track = dataclasses.replace(track, position=position)
+    fit = tune(cane(5.89e9), track, release=change.get("release"))
+    assert any(words in fault for fault in fit.faults), fit.faults
+
+
+@pytest.mark.parametrize(("scale", "hertz"), [(1e-3, "34"), (30.0, "0.11")])
+def test_a_wrong_time_is_refused(track: Trajectory, scale: float, hertz: str) -> None:
+    """Seconds named milliseconds, and numbers of pictures named seconds."""
+    with pytest.raises(TrajectoryError, match=f"swings at {hertz}.* Hz, plants at 0.2 to 50 Hz; correct the unit"):
+        tune(cane(), dataclasses.replace(track, time=scale * track.time))
+
+
+def test_a_push_and_a_pull_are_told_apart_by_their_force() -> None:
+    for kind, remedy in (("pull-release", "as of a pull; leave out --push"), ("push", "as of a push; give --push")):
+        track = measure(cane(), Experiment(kind=kind, force_noise=0.0))
+        with pytest.raises(TrajectoryError, match=remedy):
+            tune(cane(), track, pushed=kind != "push")
 
 
 @pytest.mark.parametrize("noise", [2e-3, 0.0])

@@ -56,7 +56,7 @@ class Client:
         Args:
             scene: a scene, its name in ``data/scenes`` or the path of its file. Scene and seed must be equal for all
                 clients of a world.
-            robot: name from ``data/robots``, or the path of a URDF file.
+            robot: name from ``data/robots``, or the path of a URDF, xacro, SDF or MJCF file.
             name: unique name of this actor in the world.
             connect: endpoint of the server such as ``tcp/127.0.0.1:7377``; without it the client is alone in its own
                 world.
@@ -86,7 +86,7 @@ class Client:
                 (queue,) = choose_places(self.scene, self.model, bus, number=spawn)
                 place = start_pose(self.scene, spawn or 0, queue=queue)
             else:
-                place = base_pose(pose)
+                place = base_pose(pose, self.model.terrain)
             executor = stack.enter_context(ThreadPoolExecutor(1, "spawner"))
             self._client = RobotClient(
                 self.scene, self.model, described, bus, name=name, pose=place, executor=executor, device=device

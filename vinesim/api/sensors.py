@@ -18,6 +18,7 @@ from vinesim.api.simulation import Simulation, base_pose
 from vinesim.core.errors import UsageError
 from vinesim.perception.clouds import picture_cloud, scan_cloud
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.scene.terrain import Terrain
 from vinesim.scene.values import CameraFrame, CameraInfo, CameraMount, LidarMount, LidarScan
 from vinesim.sensors.camera import camera as rgbd
 from vinesim.sensors.camera.sunlight import DEFAULT_SUN
@@ -127,7 +128,10 @@ class Camera:
             )
             self._last = simulation
         return _as(
-            Picture, self._camera.render(simulation.primitives(), _sensor_pose(pose, robot, frame), simulation.time)
+            Picture,
+            self._camera.render(
+                simulation.primitives(), _sensor_pose(pose, robot, frame, simulation.model.terrain), simulation.time
+            ),
         )
 
 
@@ -166,7 +170,9 @@ class Lidar:
         device = simulation.device
         if device not in self._lidars:
             self._lidars[device] = lidar.Lidar(self.spec, self._name, seed=self._seed, device=device)
-        made = self._lidars[device].scan(simulation.primitives(), _sensor_pose(pose, robot, frame), simulation.time)
+        made = self._lidars[device].scan(
+            simulation.primitives(), _sensor_pose(pose, robot, frame, simulation.model.terrain), simulation.time
+        )
         return _as(Scan, made)
 
 
@@ -191,14 +197,16 @@ def _first_frame(robot: Robot | None, kind: str) -> str | None:
     return mounts[0].frame if mounts else None
 
 
-def _sensor_pose(pose: Sequence[float] | np.ndarray | None, robot: Robot | None, frame: str | None) -> np.ndarray:
+def _sensor_pose(
+    pose: Sequence[float] | np.ndarray | None, robot: Robot | None, frame: str | None, terrain: Terrain | None
+) -> np.ndarray:
     """Returns the pose [7] of a sensor in the world. Raises :class:`UsageError` unless either ``pose`` or ``robot`` is
     given."""
     if (pose is None) == (robot is None):
         raise UsageError("the sensor has no place, or two; give either a pose [7] or a robot")
     if robot is None:
         assert pose is not None
-        return base_pose(pose)
+        return base_pose(pose, terrain)
     if frame is None:
         raise UsageError(f"robot {robot.name!r} carries no such sensor; give the frame of one of its links")
     return robot.frame_pose(frame)

@@ -31,6 +31,7 @@ from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.spec import Scene, load_scene
 from vinesim.scene.state import State
+from vinesim.scene.terrain import Terrain, on_ground
 from vinesim.scene.values import Contact, Detachment, Snapshot
 from vinesim.scene.wind import wind_of
 from vinesim.wind.sway import Sway
@@ -89,7 +90,7 @@ class Simulation:
             source = load_scene(source)
         if isinstance(source, Scene):
             self.scene = source
-        model = _model_of(source)
+        model = model_of(source)
         if parameters is not None and not isinstance(parameters, PhysicsParameters):
             raise UsageError(f"parameters is a {type(parameters).__name__}; give PhysicsParameters, or none")
         chosen = parameters or (self.scene.physics if self.scene else PhysicsParameters())
@@ -295,7 +296,7 @@ class Simulation:
         *,
         name: str = "",
     ) -> Robot:
-        """Add a robot, given by a name from ``data/robots`` or the path of a URDF file.
+        """Add a robot, given by a name from ``data/robots`` or the path of a URDF, xacro, SDF or MJCF file.
 
         Args:
             robot: name or path; :class:`~vinesim.robot.description.urdf.DescriptionError` if it cannot be used.
@@ -307,7 +308,9 @@ class Simulation:
         name = name or f"robot_{index}"
         if name in self.physics.rigid.robots:
             raise UsageError(f"robot {name!r} exists already; give another name")
-        self.robots[name] = added = Robot(self.physics.rigid, described, name, index, base_pose(pose))
+        self.robots[name] = added = Robot(
+            self.physics.rigid, described, name, index, base_pose(pose, self.model.terrain)
+        )
         self._robots_added += 1
         added.fit_cutters(self.physics)
         return added
@@ -347,8 +350,8 @@ class Simulation:
         return checked_index("body", body, len(self.model.body_mass), UsageError)
 
 
-def base_pose(pose: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Returns the pose [7] of a robot's base from (x, y, yaw) in m and rad, or from a pose [7]. Raises
+def base_pose(pose: Sequence[float] | np.ndarray, terrain: Terrain | None = None) -> np.ndarray:
+    """Returns the pose [7] of a robot's base from (x, y, yaw) in m and rad, on the ground, or from a pose [7]. Raises
     :class:`UsageError` for other values."""
     given = _numbers(pose)
     if given.shape not in ((3,), (7,)) or not np.isfinite(given).all():
@@ -356,10 +359,11 @@ def base_pose(pose: Sequence[float] | np.ndarray) -> np.ndarray:
         raise UsageError(f"pose is {shown}; give (x, y, yaw) in m and rad, or position and quaternion [7]")
     if len(given) == 7:
         return frames.checked_pose("pose", given, UsageError)
-    return frames.pose(np.array([given[0], given[1], 0.0]), frames.from_yaw(given[2]))
+    return on_ground(terrain, frames.pose(np.array([given[0], given[1], 0.0]), frames.from_yaw(given[2])))
 
 
-def _model_of(source: Model | Scene | CaneBuilder | TreeBuilder | Iterable[CaneBuilder | TreeBuilder]) -> Model:
+def model_of(source: Model | Scene | CaneBuilder | TreeBuilder | Iterable[CaneBuilder | TreeBuilder]) -> Model:
+    """Returns the model of a source that is no name or file. Raises :class:`UsageError` for other values."""
     if isinstance(source, Model):
         return source
     if isinstance(source, Scene):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vinesim.core import frames
+from vinesim.scene.terrain import Terrain
 from vinesim.scene.values import HumanPose
 
 STEP_LENGTH = 0.28
@@ -21,9 +22,11 @@ class LegEstimator:
     The feet depend on past motion: two estimators with the same head pose may give different legs.
     """
 
-    def __init__(self, pose: HumanPose, dt: float = 0.01) -> None:
-        """``pose``: pose at the start; ``dt`` [s]: time between calls of :meth:`update`."""
+    def __init__(self, pose: HumanPose, dt: float = 0.01, terrain: Terrain | None = None) -> None:
+        """``pose``: pose at the start; ``dt`` [s]: time between calls of :meth:`update`; ``terrain``: uneven ground, on
+        which the feet stand."""
         self.dt = dt
+        self._terrain = terrain
         self._below_head = frames.compose(
             frames.inverse(_upright(pose.head)), np.stack([pose.hips, pose.left_foot, pose.right_foot])
         )
@@ -35,7 +38,10 @@ class LegEstimator:
 
     def stand(self, head: np.ndarray) -> None:
         """Put both feet under the head pose ``head`` [7] at once, for a person who was moved there without walking."""
-        self._feet = frames.compose(_upright(head), self._below_head)[1:]
+        there = frames.compose(_upright(head), self._below_head)
+        self._feet = there[1:]
+        for foot in (0, 1):
+            self._feet[foot, 2] += self._rise(there[1 + foot], there[0])
         self._swing = [1.0, 1.0]
         self._head = np.asarray(head[:3], float).copy()
 
@@ -57,9 +63,16 @@ class LegEstimator:
                 goal = there[1 + foot, :3] + (1.5 - share) * ahead
                 gone = share * share * (3.0 - 2.0 * share)  # smoothstep: no jump of velocity at either end
                 self._feet[foot, :3] = self._start[foot, :3] + gone * (goal - self._start[foot, :3])
-                self._feet[foot, 2] = there[1 + foot, 2] + LIFT_HEIGHT * np.sin(np.pi * share)
+                sole = there[1 + foot, 2] + self._rise(self._feet[foot], there[0])
+                self._feet[foot, 2] = sole + LIFT_HEIGHT * np.sin(np.pi * share)
                 self._feet[foot, 3:] = there[1 + foot, 3:]
         return np.stack([there[0], *self._feet])
+
+    def _rise(self, foot: np.ndarray, hips: np.ndarray) -> float:
+        """Returns by how much the ground under ``foot`` [2 or more] m is higher than below ``hips`` [2 or more] m."""
+        if self._terrain is None:
+            return 0.0
+        return float(np.subtract(*self._terrain.height(*np.stack([foot[:2], hips[:2]], 1))))
 
 
 def _upright(head: np.ndarray) -> np.ndarray:

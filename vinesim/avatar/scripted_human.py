@@ -16,6 +16,7 @@ from vinesim.avatar.gestures import finger_bend
 from vinesim.avatar.leg_estimator import LegEstimator
 from vinesim.core import frames
 from vinesim.rigid.human_posture import standing_pose
+from vinesim.scene.terrain import Terrain, ground_height
 from vinesim.scene.values import HumanPose
 
 WALK_SPEED = 1.1
@@ -34,18 +35,25 @@ class ScriptedHuman:
     It is called once a step and returns the pose at the end of the step.
     """
 
-    def __init__(self, root: np.ndarray, height: float = 1.75, dt: float = 0.01) -> None:
+    def __init__(
+        self, root: np.ndarray, height: float = 1.75, dt: float = 0.01, terrain: Terrain | None = None
+    ) -> None:
+        """``root`` [7]: pose at which the person stands; ``height``: of the person [m]; ``dt`` [s]: duration of a step;
+        ``terrain``: uneven ground, on which the person walks."""
         self.dt = dt
+        self._terrain = terrain
         self.root = np.asarray(root, float)
         self.pose = standing_pose(self.root, height)
         self.closed = {"left": False, "right": False}
         self._heading = frames.to_yaw(self.root[3:])
         self._place = self.root[:2].copy()
+        self._above = float(self.root[2]) - float(ground_height(terrain, *self._place))
+        """Height [m] of the body's origin above the ground."""
         here = frames.inverse(self._standing_frame())
         self._head = frames.compose(here, self.pose.head)
         self._rest = {"left": frames.compose(here, self.pose.left), "right": frames.compose(here, self.pose.right)}
         self._hands = {side: pose.copy() for side, pose in self._rest.items()}
-        self._legs = LegEstimator(self.pose, dt)
+        self._legs = LegEstimator(self.pose, dt, terrain)
         self._actions: deque[Iterator[None]] = deque()
 
     def do(self, *actions: Iterator[None]) -> ScriptedHuman:
@@ -61,6 +69,8 @@ class ScriptedHuman:
         head = frames.compose(stand, self._head)
         hips, left_foot, right_foot = self._legs.update(head)
         left, right = (frames.compose(stand, self._hands[side]) for side in ("left", "right"))
+        if self._terrain is not None:
+            self.root = stand
         self.pose = HumanPose(
             self.root,
             head,
@@ -153,4 +163,7 @@ class ScriptedHuman:
 
     def _standing_frame(self) -> np.ndarray:
         """Pose [7] of the body: on the ground, below the hips."""
-        return frames.pose(np.array([*self._place, self.root[2]]), frames.from_yaw(self._heading))
+        height = float(self.root[2])
+        if self._terrain is not None:
+            height = self._above + float(self._terrain.height(*self._place))
+        return frames.pose(np.array([*self._place, height]), frames.from_yaw(self._heading))

@@ -12,6 +12,7 @@ from vinesim.avatar.gestures import OPEN_HAND, FingerBend, Gestures, shears_grip
 from vinesim.avatar.leg_estimator import LegEstimator
 from vinesim.core import frames
 from vinesim.rigid.human_posture import standing_pose
+from vinesim.scene.terrain import Terrain
 from vinesim.scene.values import HumanPose
 
 MAX_PERIOD = 0.1
@@ -53,9 +54,11 @@ class TrackedHuman:
         dt: float = 0.01,
         clock: Callable[[], float] | None = None,
         gestures: Gestures | None = None,
+        terrain: Terrain | None = None,
     ) -> None:
         """``root`` [7]: pose at which the person stands until the first input. ``height``: of the person [m].
-        ``clock``: function that returns a time [s], by which the intervals between inputs are measured.
+        ``clock``: function that returns a time [s], by which the intervals between inputs are measured. ``terrain``:
+        uneven ground, on which the person stands.
 
         Without a ``clock`` the intervals are counted in steps of ``dt``.
         """
@@ -65,7 +68,8 @@ class TrackedHuman:
         self.pose = standing_pose(root, height)
         self._below_head = frames.compose(frames.inverse(self.pose.head), np.stack([self.pose.left, self.pose.right]))
         """Poses [2, 7] of hands that hang down, in the upright frame of the head."""
-        self._legs = LegEstimator(self.pose, dt)
+        self._legs = LegEstimator(self.pose, dt, terrain)
+        self._terrain = terrain
         self._lock = threading.Lock()
         self._next: TrackedPoints | None = None
         self._points: TrackedPoints | None = None
@@ -93,7 +97,8 @@ class TrackedHuman:
         self._share = min(1.0, self._share + self.dt / self._period)
         head, left, right = _between(self._start, self._goal, self._share)
         hips, left_foot, right_foot = self._legs.update(head)
-        root = frames.pose(np.array([*hips[:2], self.pose.root[2]]), frames.from_yaw(frames.to_yaw(head[3:])))
+        floor = self.pose.root[2] if self._terrain is None else self._terrain.height(*hips[:2])
+        root = frames.pose(np.array([*hips[:2], floor]), frames.from_yaw(frames.to_yaw(head[3:])))
         told = self._points or TrackedPoints(head)
         fingers = [
             shears_grip(closed=closed) if shears else bend

@@ -22,7 +22,7 @@ import typer
 
 from vinesim.cli.commands.client import client
 from vinesim.cli.commands.demo import demo
-from vinesim.cli.commands.images import dataset, render, scene_import_plant, scene_show
+from vinesim.cli.commands.images import dataset, export, render, scene_import_plant, scene_show
 from vinesim.cli.commands.perception import fuse, view
 from vinesim.cli.commands.recording import record, replay
 from vinesim.cli.commands.server import server
@@ -65,6 +65,7 @@ for command in (
     replay,
     render,
     dataset,
+    export,
     fuse,
     view,
     track,

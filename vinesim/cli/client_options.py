@@ -62,11 +62,22 @@ class ClientOptions:
         list[str] | None,
         OF_ROBOT,
         typer.Option(
-            help="Robots: a URDF file, or the name of a shipped robot: vinebot, logistic. Given several times, the "
-            "robots are NAME_1, NAME_2, ..., each in a namespace of its own."
+            help="Robots: a URDF, xacro, SDF or MJCF file, a pipe, - for the standard input, or the name of a shipped "
+            "robot: vinebot, logistic. Given several times, the robots are NAME_1, NAME_2, ..., each in a namespace of "
+            "its own."
         ),
     ] = None
     """None: one robot of the kind vinebot."""
+    srdf: Annotated[
+        pathlib.Path | None,
+        OF_ROBOT,
+        typer.Option(help="Robots: the SRDF of MoveIt with joint groups; by default the one beside the robot file."),
+    ] = None
+    xacro_args: Annotated[
+        list[str] | None,
+        OF_ROBOT,
+        typer.Option(metavar="NAME:=VALUE", help="Robots: arguments of a xacro file, separated by blanks."),
+    ] = None
     spawn: Annotated[
         int | None,
         typer.Option(

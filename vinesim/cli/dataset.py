@@ -25,7 +25,7 @@ from vinesim.core.progress import ProgressLine
 from vinesim.kernels.compilation import SENSOR_PACKAGES, compile_kernels
 from vinesim.plants.device_buffers import find_device
 from vinesim.scene.spec import load_scene
-from vinesim.sensors.export import dataset
+from vinesim.sensors.export import annotations, dataset
 from vinesim.sensors.export.dataset import DatasetError, DatasetPlan
 from vinesim.sensors.export.files import remove_partial_files
 
@@ -63,6 +63,10 @@ def run(
     device: str,
     scheduler: str | None = None,
     sensor: Sequence[str] | None = None,
+    segmentation: str = "polygons",
+    yolo: str = "detect",
+    negatives: float = 0.0,
+    semantic: bool = False,
 ) -> int:
     """Render the missing images, then gather the annotations of all images. Returns the exit code."""
     if seed < 0:
@@ -73,6 +77,14 @@ def run(
         )
     if not 0.0 <= actors <= 1.0:
         raise UsageError(f"--actors is {actors:g}: give a share of the images, 0 to 1")
+    if not 0.0 <= negatives <= 1.0:
+        raise UsageError(f"--negatives is {negatives:g}: give a share of the images, 0 to 1")
+    for option, given, known in (
+        ("--segmentation", segmentation, annotations.SEGMENTATIONS),
+        ("--yolo", yolo, annotations.YOLO_TASKS),
+    ):
+        if given not in known:
+            raise UsageError(f"{option} is {given!r}: give {', '.join(known[:-1])} or {known[-1]}")
     find_device(device)
     loaded = load_scene(scene)
     randomizer = SceneRandomizer(actors, loaded.physics) if actors > 0.0 else None
@@ -84,6 +96,8 @@ def run(
         randomizer,
         device,
         parse_sensors(sensor or (), None if size is None else parse_size(size)),
+        negatives,
+        semantic,
     )
     running: list[Worker] = []
     try:
@@ -93,7 +107,7 @@ def run(
         if scheduler is not None:
             with _progress(images, images - len(wanted)) as advance:
                 _render_on_cluster(scheduler, plan, out, wanted, advance)
-            return _finish(out, images, len(wanted))
+            return _finish(out, images, len(wanted), segmentation, yolo)
         # With a GPU, the cores only generate vineyards, write files and compute the truth; all workers share the GPU.
         cores = os.cpu_count() or 2
         shares = _shares(wanted, workers or max(cores // 2 if device == "cpu" else cores, 1))
@@ -107,7 +121,7 @@ def run(
         return 130
     finally:
         _stop_workers(running, out)
-    return _finish(out, images, len(wanted))
+    return _finish(out, images, len(wanted), segmentation, yolo)
 
 
 @contextlib.contextmanager
@@ -129,11 +143,11 @@ def _progress(images: int, done: int) -> Iterator[Callable[[int], None]]:
         yield show
 
 
-def _finish(out: pathlib.Path, images: int, new: int) -> int:
-    """Gather the annotations and print a summary. Returns the exit code."""
+def _finish(out: pathlib.Path, images: int, new: int, segmentation: str, yolo: str) -> int:
+    """Write the files that trainers read, and print a summary. Returns the exit code."""
     splits = collections.Counter(map(dataset.split_of, range(images)))
     parts = ", ".join(f"{splits[split]} {split}" for split in dataset.SPLITS)
-    print(f"{dataset.finish(out, images)}: {images} images ({parts}), {new} of them new")
+    print(f"{dataset.finish(out, images, segmentation, yolo)}: {images} images ({parts}), {new} of them new")
     missing = [split for split in dataset.SPLITS if not splits[split]]
     if missing:
         needs = " and ".join(f"--images {dataset.split_needs(split)} for {split}" for split in missing)

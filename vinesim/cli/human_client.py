@@ -42,9 +42,9 @@ def run(options: ClientOptions) -> int:
                 options.out.mkdir(parents=True, exist_ok=True)
         bus = session.bus(session.name)
         start = start_pose(session.scene, session.spawn or 0, queue=session.choose_places(bus)[0])
-        human = ScriptedHuman(start, options.height)
+        human = ScriptedHuman(start, options.height, terrain=session.model.terrain)
         if options.is_for_page:
-            human = TrackedHuman(start, options.height, gestures=gestures)
+            human = TrackedHuman(start, options.height, gestures=gestures, terrain=session.model.terrain)
         client = Client(
             session.scene,
             session.model,

@@ -46,8 +46,6 @@ class Viewpoint:
                 raise UsageError(f"{self.place} has the {name} {point.tolist()}; give x, y, z in metres")
         if np.linalg.norm(self.target - self.eye) < 1e-6:
             raise UsageError(f"{self.place} looks at the position of the camera; give another point")
-        if self.eye[2] <= 0.0:
-            raise UsageError(f"{self.place} is below the ground; give a height above 0")
 
 
 def run(
@@ -149,6 +147,7 @@ class _Work:
         primitives = Primitives(model, device=self.device)
         primitives.update(view)
         for viewpoint in self.viewpoints:
+            _check_above_ground(model, viewpoint)
             _check_not_enclosed(primitives, viewpoint)
         if self.is_tour:
             tour_folder.begin(self.out, self.settings())
@@ -313,6 +312,15 @@ class _Stage:
             f"{len(in_sight)} bunches, {sum(t.berries_seen for t in in_sight)} of "
             f"{sum(t.berries for t in in_sight)} berries and {sum(t.cut_seen for t in in_sight)} cut points in sight"
         )
+
+
+def _check_above_ground(model: Model, viewpoint: Viewpoint) -> None:
+    """Raise :class:`UsageError` if the camera is not above the ground."""
+    from vinesim.scene.terrain import ground_height
+
+    ground = float(ground_height(model.terrain, *viewpoint.eye[:2]))
+    if viewpoint.eye[2] <= ground:
+        raise UsageError(f"{viewpoint.place} is below the ground; give a height above {ground:.4g}")
 
 
 def _check_not_enclosed(primitives: Primitives, viewpoint: Viewpoint) -> None:

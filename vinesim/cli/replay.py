@@ -268,7 +268,7 @@ def _eyes(tape: Recording, model: Model, pose: tuple[float, float, float] | None
     from vinesim.client.spectator import standing_view
 
     if pose is not None:
-        return standing_view(*pose)
+        return standing_view(*pose, model.terrain)
     return first_view(_first_pose(tape), model, model.forward_kinematics(model.joint_settled)[:, :3])
 
 
@@ -290,7 +290,7 @@ def _step(spectator: Spectator, bus: ReplayBus, speed: float, *, follow: bool) -
     bus.play(spectator.physics.dt * speed)
     rigid = spectator.physics.rigid
     if follow and rigid.robots:
-        spectator.pose = follow_view(rigid.base_state(min(rigid.robots))[0])
+        spectator.pose = follow_view(rigid.base_state(min(rigid.robots))[0], spectator.model.terrain)
     spectator.tick()
 
 

@@ -30,7 +30,10 @@ from vinesim.scene.values import SensorMode, SensorPacing
 def run(options: ClientOptions) -> int:
     """Build the client from its options, step until the end, then write the requested files. Returns the exit code."""
     validate_task_name(options.job)
-    descriptions = [load_description(robot) for robot in options.robot or ["vinebot"]]
+    descriptions = [
+        load_description(robot, srdf=options.srdf, xacro_args=options.xacro_args or ())
+        for robot in options.robot or ["vinebot"]
+    ]
     if options.controllers == "none":
         descriptions = [only_hardware(description) for description in descriptions]
     with ClientSession(options) as session:

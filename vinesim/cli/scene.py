@@ -1,4 +1,4 @@
-"""``vinesim scene``: shows scenes and imports plants of other programs."""
+"""``vinesim scene`` and ``vinesim export``: shows and exports scenes, and imports plants of other programs."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from rich.table import Table
 
 from vinesim.core import frames
 from vinesim.core.errors import WriteError
+from vinesim.export.vineyard_file import check_file, write_vineyard
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.plant_import.imported_plant import import_plant
 from vinesim.scene.plant_import.wood import build_model
@@ -57,4 +58,19 @@ def show(file: str, seed: int | None, out: pathlib.Path | None) -> int:
     except OSError as bad:
         raise WriteError(f"--out {target} cannot be written: {bad.strerror or bad}; give another file") from None
     console.print(f"picture: {target}")
+    return 0
+
+
+def export_scene(file: str, seed: int | None, out: pathlib.Path, leaves: bool) -> int:
+    """Write a scene for another simulator, and print what was written. Returns the exit code."""
+    path = check_file(out, "--out")
+    scene = with_seed(load_scene(file), seed)
+    made = write_vineyard(generate(scene), path, name=scene.name, leaves=leaves, parameters=scene.physics)
+    print(
+        f"{path}: {len(made.links)} bodies of plants, {sum(link.mass for link in made.links):.4g} kg; "
+        f"{len(made.ties)} ties, {len(made.fixed)} fixed pieces, {len(made.crates)} boxes; "
+        f"{path.stat().st_size / 1e6:.1f} MB"
+    )
+    if path.suffix.lower() == ".xml":
+        print(f"its time step is {1e3 * made.timestep:g} ms; a longer step may be unstable")
     return 0

@@ -15,7 +15,7 @@ def run(options: ClientOptions) -> int:
     """Watch until a signal or the time limit; pictures go to ``--out``. Returns the exit code."""
     with ClientSession(options) as session:
         start = spawn_pose(session.scene, session.spawn or 0)
-        eyes = standing_view(float(start[0]), float(start[1]), frames.to_yaw(start[3:]))
+        eyes = standing_view(float(start[0]), float(start[1]), frames.to_yaw(start[3:]), session.model.terrain)
         if session.spawn is None:  # an actor may stand there
             model = session.model
             eyes = first_view(start, model, model.forward_kinematics(model.joint_settled)[:, :3])

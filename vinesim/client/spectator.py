@@ -15,6 +15,7 @@ from vinesim.net.replication.replication_state import SPECTATOR
 from vinesim.net.replication.replicator import Replicator
 from vinesim.net.transport.bus import Bus
 from vinesim.robot.description.description import RobotDescription
+from vinesim.scene.terrain import Terrain, on_ground
 from vinesim.scene.values import CameraFrame, CameraInfo, CameraMount, HumanPose, RobotUpdate
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export import images
@@ -32,18 +33,18 @@ FOLLOW_YAW = 0.7
 """Angle between the line straight behind a followed robot and the line from the robot to the eyes [rad]."""
 
 
-def standing_view(x: float, y: float, heading: float) -> np.ndarray:
+def standing_view(x: float, y: float, heading: float, terrain: Terrain | None = None) -> np.ndarray:
     """Returns the pose [7] m, 1 of the eyes of a person who stands at (x, y) [m] and looks along ``heading`` [rad]."""
-    return frames.pose(np.array([x, y, EYE_HEIGHT]), frames.from_yaw(heading))
+    return on_ground(terrain, frames.pose(np.array([x, y, EYE_HEIGHT]), frames.from_yaw(heading)))
 
 
-def follow_view(base: np.ndarray) -> np.ndarray:
+def follow_view(base: np.ndarray, terrain: Terrain | None = None) -> np.ndarray:
     """Returns the pose [7] m, 1 of the eyes of a person who looks over the shoulder of a robot with its base at
     ``base`` [7]."""
     ahead = frames.rotate(base[3:], np.array([1.0, 0.0, 0.0]))
     heading = float(np.arctan2(ahead[1], ahead[0])) + FOLLOW_YAW
     eye = base[:2] - FOLLOW_DISTANCE * np.array([np.cos(heading), np.sin(heading)])
-    return standing_view(float(eye[0]), float(eye[1]), heading)
+    return standing_view(float(eye[0]), float(eye[1]), heading, terrain)
 
 
 class Spectator(Client):

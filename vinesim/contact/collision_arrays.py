@@ -151,8 +151,9 @@ class RigidArrays:
         self.world = rigid.mj_model
         data = rigid.mj_data
         world = self.world
-        self.capacity = world.ngeom
         self.static = len(rigid.static_geoms.id)
+        # uneven ground is one geom for MuJoCo, and a list of tiles here
+        self.capacity = world.ngeom + self.static - len(np.unique(rigid.static_geoms.id))
         self.geoms = SharedArrays.zeros(structs.Geoms, self.capacity, count=np.zeros(2, np.int32))
         self.geom_states = SharedArrays.zeros(structs.GeomStates, self.capacity)
         self.bunch_of_geom = np.full(self.capacity, -1, np.int32)

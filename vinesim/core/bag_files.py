@@ -15,12 +15,12 @@ import sqlite3
 import struct
 import tempfile
 from collections.abc import Collection, Iterator
-from typing import Any, BinaryIO, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import yaml
 import zstandard
 from mcap.exceptions import EndOfFile
-from mcap.reader import make_reader
+from mcap.reader import SeekingReader
 from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 
@@ -136,7 +136,7 @@ def _natural(file: pathlib.Path) -> list[Any]:
 
 def _open(file: pathlib.Path, is_packed: bool) -> _File:
     if file.suffix in (".zstd", ".zst"):
-        stream: BinaryIO = tempfile.NamedTemporaryFile(prefix="vinesim-bag-")  # noqa: SIM115 (lives as long as the bag)
+        stream: IO[bytes] = tempfile.NamedTemporaryFile(prefix="vinesim-bag-")  # noqa: SIM115 (lives as long as the bag)
         with file.open("rb") as packed, contextlib.suppress(zstandard.ZstdError):  # a cut file ends early
             zstandard.ZstdDecompressor().copy_stream(packed, stream)
         stream.seek(0)
@@ -158,7 +158,7 @@ def _open(file: pathlib.Path, is_packed: bool) -> _File:
 class _File:
     """One file of a recording."""
 
-    def __init__(self, path: pathlib.Path, stream: BinaryIO, is_packed: bool) -> None:
+    def __init__(self, path: pathlib.Path, stream: IO[bytes], is_packed: bool) -> None:
         """``is_packed``: whether each message is compressed by itself."""
         self.path = path
         self.stream = stream
@@ -185,11 +185,11 @@ class _File:
 
 
 class _McapFile(_File):
-    def __init__(self, path: pathlib.Path, stream: BinaryIO, is_packed: bool) -> None:
+    def __init__(self, path: pathlib.Path, stream: IO[bytes], is_packed: bool) -> None:
         super().__init__(path, stream, is_packed)
         self._is_indexed = False
         try:
-            summary = make_reader(stream, record_size_limit=MAX_RECORD).get_summary()
+            summary = SeekingReader(stream, record_size_limit=MAX_RECORD).get_summary()
         except Exception:  # the end, which has the summary, is missing or damaged
             summary = None
         statistics = None if summary is None else summary.statistics
@@ -228,7 +228,7 @@ class _McapFile(_File):
     def read(self, topics: Collection[str] | None) -> Iterator[BagMessage]:
         if self._is_indexed:
             self.stream.seek(0)
-            reader = make_reader(self.stream, validate_crcs=True, record_size_limit=MAX_RECORD)
+            reader = SeekingReader(self.stream, validate_crcs=True, record_size_limit=MAX_RECORD)
             for _, channel, message in reader.iter_messages(topics=topics):
                 yield BagMessage(channel.topic, message.log_time, message.data)
             return
@@ -242,7 +242,7 @@ class _McapFile(_File):
 
 
 class _SqliteFile(_File):
-    def __init__(self, path: pathlib.Path, stream: BinaryIO, is_packed: bool) -> None:
+    def __init__(self, path: pathlib.Path, stream: IO[bytes], is_packed: bool) -> None:
         super().__init__(path, stream, is_packed)
         head = stream.read(100)
         there = stream.seek(0, 2)

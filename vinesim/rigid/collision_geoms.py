@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from typing import Any
 
 import mujoco
@@ -11,6 +12,7 @@ import numpy as np
 
 from vinesim.core.warp_arrays import SharedArrays
 from vinesim.kernels.contact import structs
+from vinesim.scene.terrain import Terrain
 
 _PLANE, _SPHERE, _CAPSULE, _CYLINDER, _BOX, _MESH = (
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))  # int: NumPy compares with MuJoCo's enum entry by entry
@@ -18,6 +20,12 @@ _PLANE, _SPHERE, _CAPSULE, _CYLINDER, _BOX, _MESH = (
 )
 PLANE_HALF_SIZE = 1e6
 """Half edge [m] of the bounding box of the ground plane."""
+TILE_SIZE = 4.0
+"""Side [m] of the squares into which uneven ground is divided. TUNED: a tree reaches over at most four."""
+TILE_DEPTH = 1.0
+"""Depth [m] of the box of a tile below the lowest point of its ground. A capsule below it does not touch the ground."""
+TILE_OVERHANG = 20.0
+"""Length [m] by which the tiles at the edge of uneven ground extend beyond it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,8 +37,8 @@ class RigidGeoms:
     body: np.ndarray
     """[geom] index of the geom's MuJoCo body."""
     kind: np.ndarray
-    """[geom] MuJoCo's type: 0 plane, 2 sphere, 3 capsule, 4 ellipsoid, 5 cylinder, 6 box, 7 mesh. A flat mesh is
-    replaced by its bounding box."""
+    """[geom] MuJoCo's type: 0 plane, 1 tile of uneven ground, 2 sphere, 3 capsule, 4 ellipsoid, 5 cylinder, 6 box, 7
+    mesh. A flat mesh is replaced by its bounding box."""
     hull: np.ndarray
     """[geom] index of the convex hull in :func:`hull_arrays`; -1 if the geom has none."""
     size: np.ndarray
@@ -65,17 +73,62 @@ def owned_geoms(m: mujoco.MjModel, owner: dict[int, tuple[str, str]]) -> RigidGe
 def colliding(m: mujoco.MjModel, geoms: RigidGeoms) -> RigidGeoms:
     """Returns the subset of ``geoms`` whose collisions are enabled; the hands of people disable theirs while they hold
     something."""
-    rows = np.flatnonzero(m.geom_contype[geoms.id] != 0)
+    return _rows(geoms, np.flatnonzero(m.geom_contype[geoms.id] != 0))
+
+
+def static_geoms(m: mujoco.MjModel, terrain: Terrain | None = None) -> RigidGeoms:
+    """Returns the geoms of ground, trellis and old wood, which are MuJoCo's first geoms, whichever actors exist.
+
+    Uneven ground is a list of square tiles with the index of MuJoCo's height field, so that their boxes are low. The
+    plane that catches objects beyond the height field is not among the geoms.
+    """
+    ids = np.flatnonzero((m.geom_bodyid == 0) & (m.geom_contype != 0))
+    if terrain is not None:
+        ids = ids[m.geom_type[ids] != _PLANE]
+    geoms = _of(m, ids, [("world", m.geom(g).name) for g in ids.tolist()])
+    if terrain is None:
+        return geoms
+    low, high = _tiles(terrain)
+    ground = _of(m, np.zeros(len(low), int), [("world", "ground")] * len(low))
+    half = 0.5 * (high - low)
+    center = 0.5 * (high + low) - m.geom_pos[0]
+    tiles = dataclasses.replace(ground, center=center, half=half, radius=np.linalg.norm(half, axis=1))
+    return concatenate(tiles, _rows(geoms, np.arange(1, len(ids))))
+
+
+def _tiles(terrain: Terrain) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the lower and the upper corners [tile, 3] m of boxes around squares of the ground; those at its edge
+    extend beyond the grid."""
+    side = max(round(TILE_SIZE / terrain.cell), 1)
+    lines = []
+    for axis, nodes in enumerate(terrain.residual.shape[::-1]):
+        line = terrain.origin[axis] + terrain.cell * np.arange(0, nodes - 1, side)
+        lines.append(np.concatenate([[line[0] - TILE_OVERHANG], line[1:], [terrain.end[axis] + TILE_OVERHANG]]))
+    # every node of the grid, and the ends beyond it, where the ground is linear
+    x, y = (
+        np.concatenate([line[:1], start + terrain.cell * np.arange(nodes), line[-1:]])
+        for line, start, nodes in zip(lines, terrain.origin, terrain.residual.shape[::-1], strict=True)
+    )
+    height = terrain.height(x, y[:, None])
+    low = []
+    high = []
+    for y0, y1 in itertools.pairwise(lines[1]):
+        for x0, x1 in itertools.pairwise(lines[0]):
+            # one node more on each side, because borders of tiles are nodes up to rounding
+            rows = slice(max(int(np.searchsorted(y, y0)) - 1, 0), int(np.searchsorted(y, y1)) + 2)
+            columns = slice(max(int(np.searchsorted(x, x0)) - 1, 0), int(np.searchsorted(x, x1)) + 2)
+            part = height[rows, columns]
+            low.append((x0, y0, part.min() - TILE_DEPTH))
+            high.append((x1, y1, part.max()))
+    return np.array(low), np.array(high)
+
+
+def _rows(geoms: RigidGeoms, rows: np.ndarray) -> RigidGeoms:
+    """Returns the ``rows`` [k] of a list of geoms."""
     names = [field.name for field in dataclasses.fields(RigidGeoms) if field.name not in ("actor", "link")]
     arrays: dict[str, Any] = {name: getattr(geoms, name)[rows] for name in names}
     actor, link = (tuple(map(column.__getitem__, rows.tolist())) for column in (geoms.actor, geoms.link))
     return RigidGeoms(actor=actor, link=link, **arrays)
-
-
-def static_geoms(m: mujoco.MjModel) -> RigidGeoms:
-    """Returns the geoms of ground, trellis and old wood, which are MuJoCo's first geoms, whichever actors exist."""
-    ids = np.flatnonzero((m.geom_bodyid == 0) & (m.geom_contype != 0))
-    return _of(m, ids, [("world", m.geom(g).name) for g in ids.tolist()])
 
 
 def _of(m: mujoco.MjModel, ids: np.ndarray, names: list[tuple[str, str]]) -> RigidGeoms:
@@ -150,8 +203,9 @@ def hull_numbers(m: mujoco.MjModel, ids: np.ndarray) -> np.ndarray:
     return np.where(has_hull[mesh], mesh, -1).astype(np.int32)
 
 
-def hull_arrays(m: mujoco.MjModel) -> SharedArrays:
-    """Returns the convex hulls of all meshes of a world; a mesh without a hull has an empty entry."""
+def hull_arrays(m: mujoco.MjModel, terrain: Terrain | None = None) -> SharedArrays:
+    """Returns the convex hulls of all meshes of a world, and its uneven ground; a mesh without a hull has an empty
+    entry."""
     planes = [np.zeros((0, 4))]
     edges = [np.zeros((0, 2, 3))]
     sides = [np.zeros((0, 2), int)]
@@ -180,6 +234,8 @@ def hull_arrays(m: mujoco.MjModel) -> SharedArrays:
         edge_end=corners[:, 1].copy(),
         edge_left=side[:, 0].copy(),
         edge_right=side[:, 1].copy(),
+        ground=np.zeros((0, 0), np.float32) if terrain is None else terrain.residual,
+        ground_frame=np.zeros(5) if terrain is None else np.array([*terrain.origin, terrain.cell, *terrain.slope]),
     )
 
 

@@ -68,20 +68,19 @@ HOME_CLEARANCE = 1e-3
 GUESSED: the accuracy of collision shapes and of servos that hold the pose."""
 
 
-def let_links_collide(parsed: mujoco.MjSpec, given: RobotSpec, code: int) -> None:
+def let_links_collide(parsed: mujoco.MjSpec, given: RobotSpec, code: int, clearance: float) -> None:
     """Enable collisions of a ``parsed`` robot's links with each other and with the ground.
 
-    ``given``: the robot's settings; ``code``: its collision code. Shapes that are fixed to the base do not collide with
-    the ground, because the base moves in a plane at constant height.
+    ``given``: the robot's settings; ``code``: its collision code; ``clearance``: height of the base above the ground
+    [m]. Shapes that are fixed to the base do not collide with the ground, because the base moves in a plane at constant
+    height, or follows uneven ground.
     """
     alone = parsed.copy()
     for number, geom in enumerate(alone.geoms):
         geom.name = str(number)
         geom.contype = geom.conaffinity = 1
         geom.margin = HOME_CLEARANCE
-    ground = alone.worldbody.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0.0, 0.0, -float(given.pose[2])]
-    )
+    ground = alone.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0.0, 0.0, -clearance])
     ground.contype = ground.conaffinity = 1
     m = compile_without_contacts(alone)
     geoms = _touching_at_home(m, given)

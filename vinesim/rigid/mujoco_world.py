@@ -19,6 +19,7 @@ from vinesim.rigid import collision_geoms, free_bunch, recompile, static_world
 from vinesim.rigid.collision_geoms import hull_arrays
 from vinesim.rigid.effective_mass import EffectiveMass
 from vinesim.rigid.free_bunch import FreeBunch
+from vinesim.rigid.ground_contacts import GroundContacts
 from vinesim.rigid.human_body import HandBody, HumanBody, HumanError
 from vinesim.rigid.human_posture import BODY_PARTS, SIDES, VISUAL_PARTS
 from vinesim.rigid.mujoco_contacts import PairFriction, SoftWires, SpeculativeContacts
@@ -99,6 +100,7 @@ class MujocoWorld:
         self._pair_friction = PairFriction(parameters)
         self._speculative_contacts = SpeculativeContacts()
         self._soft_wires: SoftWires | None = None
+        self._ground_contacts = None if model.terrain is None else GroundContacts(model.terrain)
         _log_mujoco_warnings()
         self._recompile()
 
@@ -245,9 +247,8 @@ class MujocoWorld:
             free_bunch.disable_collision(mj_model, slot)
         for slot, body in bunches.values():
             free_bunch.activate(mj_model, slot, body, self._derive(body))
-        return CompiledWorld(
-            robots, humans, boxes, slots, mj_model, WorldNames.of(mj_model), bunches, hull_arrays(mj_model)
-        )
+        hulls = hull_arrays(mj_model, self.model.terrain)
+        return CompiledWorld(robots, humans, boxes, slots, mj_model, WorldNames.of(mj_model), bunches, hulls)
 
     def _derive(self, body: FreeBunch) -> mujoco.MjModel:
         """Returns MuJoCo's constants of a free bunch, computed once; ``ValueError`` if it has too many shapes or
@@ -297,7 +298,7 @@ class MujocoWorld:
             for hand in human.hands:
                 self._restore_grasp(hand)
         if before is None:
-            self.static_geoms = collision_geoms.static_geoms(m)
+            self.static_geoms = collision_geoms.static_geoms(m, self.model.terrain)
         self._update_tables()
 
     def _restore_grasp(self, hand: HandBody) -> None:
@@ -345,6 +346,8 @@ class MujocoWorld:
     def _update_geoms(self) -> None:
         """Update the list of colliding geoms after a hand closed or opened, and increment :attr:`generation`."""
         self.generation += 1
+        if self._ground_contacts is not None:
+            self._ground_contacts.use_world()
         self.geoms = collision_geoms.colliding(self.mj_model, self._owned_geoms)
 
 

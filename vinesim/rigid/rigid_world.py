@@ -38,6 +38,8 @@ from vinesim.scene.values.signals import Color
 from vinesim.wires.deflected_wires import DeflectedWires
 
 _CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
+_GROUND_KINDS = int(mujoco.mjtGeom.mjGEOM_HFIELD)
+"""Greatest of MuJoCo's types of geoms that are the ground: plane and height field."""
 _HIPS = BODY_PARTS.index("hips")
 
 MAX_RATE = 1e4
@@ -115,11 +117,12 @@ class RigidWorld(MujocoWorld):
                 humans.append(HumanBody(spec, code, self.parameters, is_remote=is_remote))
             elif replaces:
                 old = self.robot(spec.name)
-                new = RobotBody(dataclasses.replace(spec, pose=old.spec.pose), old.code, self.parameters)
+                resumed = dataclasses.replace(spec, pose=old.spec.pose)
+                new = RobotBody(resumed, old.code, self.parameters, self.model.terrain)
                 robots = [new if robot is old else robot for robot in robots]
             else:
                 code = _free_code(spec.name, "robot", static_world.ROBOT_CODES, robots, humans, RobotError)
-                robots.append(RobotBody(spec, code, self.parameters))
+                robots.append(RobotBody(spec, code, self.parameters, self.model.terrain))
         try:
             return dataclasses.replace(self._compile_world(tuple(robots), tuple(humans)), removed=removed)
         except ValueError as error:
@@ -206,6 +209,8 @@ class RigidWorld(MujocoWorld):
             self._soft_wires.place_geoms(m, d)
         # qfrc_applied still holds the forces of the last step, so a force on a sleeping box wakes it now
         mujoco.mj_step1(m, d)
+        if self._ground_contacts is not None:
+            self._ground_contacts.apply(m, d)
         if self._passing_bunches:
             self._end_passing()
         self._pair_friction.apply(m, d)
@@ -472,13 +477,7 @@ class RigidWorld(MujocoWorld):
 
     def base_state(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Returns the pose [7] and the velocity [6] (world axes) of the base link."""
-        robot = self.robot(name)
-        d = self.mj_data
-        x, y, yaw = d.qpos[robot.base_q].tolist()
-        vx, vy, wz = d.qvel[robot.base_v].tolist()
-        half = 0.5 * yaw
-        pose = np.array([x, y, robot.base_height, 0.0, 0.0, math.sin(half), math.cos(half)])
-        return pose, np.array([vx, vy, 0.0, 0.0, 0.0, wz])
+        return self.robot(name).base_state(self.mj_data)
 
     # links
 
@@ -603,7 +602,7 @@ class RigidWorld(MujocoWorld):
         for geoms in (self.geoms, self.static_geoms):
             distance = np.linalg.norm(d.geom_xpos[geoms.id] - d.xpos[hand.body], axis=1)
             for i in np.flatnonzero(distance - geoms.radius < reach + PALM_TO_FINGERTIP):
-                if geoms.kind[i] != mujoco.mjtGeom.mjGEOM_PLANE and geoms.actor[i] != name:
+                if geoms.kind[i] > _GROUND_KINDS and geoms.actor[i] != name:
                     gap = min(mujoco.mj_geomDistance(m, d, geom, int(geoms.id[i]), reach, None) for geom in of_hand)
                     if gap < reach and (best is None or gap < best[0]):
                         best = (gap, geoms.actor[i], geoms.link[i])

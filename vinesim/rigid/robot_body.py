@@ -1,4 +1,5 @@
-"""One robot in MuJoCo's world: a planar base on servos, driven joints, sensors in links.
+"""One robot in MuJoCo's world: a planar base on servos, driven joints, sensors in links. On uneven ground the base also
+follows the ground (:mod:`vinesim.rigid.ground_following`).
 
 MuJoCo's integrator damps a servo of stiffness K as if its damping D were larger by dt K. This keeps stiff servos and
 their loads from oscillating. A compliant joint, however, must swing with exactly the damping D; for such a joint
@@ -8,6 +9,7 @@ their loads from oscillating. A compliant joint, however, must swing with exactl
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import mujoco
 import numpy as np
@@ -17,11 +19,13 @@ from vinesim.core import frames
 from vinesim.core.warp_arrays import SharedArrays, share
 from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.rigid import joint_servos
-from vinesim.rigid import mujoco_contacts, recompile
+from vinesim.rigid import ground_following, mujoco_contacts, recompile
+from vinesim.rigid.ground_following import GroundFollower
 from vinesim.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, contact_friction, geom_user
 from vinesim.rigid.urdf import RobotError, check, collision_materials, collision_urdf, link_friction, shapes_of_robot
 from vinesim.scene.materials import Material
 from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.scene.terrain import Terrain
 from vinesim.scene.triangles import to_stl
 from vinesim.scene.values import RobotSpec, Shape
 from vinesim.scene.values.signals import UNLIT, Color
@@ -43,9 +47,15 @@ _PLANAR = ("x", "y", "yaw")
 class RobotBody:
     """One robot: targets and gains of its drives, and its indices in MuJoCo's arrays."""
 
-    def __init__(self, spec: RobotSpec, code: int, parameters: PhysicsParameters = PhysicsParameters()) -> None:
-        """``code``: collision code, one of :data:`ROBOT_CODES`. Raises :class:`RobotError` if MuJoCo cannot read the
-        URDF."""
+    def __init__(
+        self,
+        spec: RobotSpec,
+        code: int,
+        parameters: PhysicsParameters = PhysicsParameters(),
+        terrain: Terrain | None = None,
+    ) -> None:
+        """``code``: collision code, one of :data:`ROBOT_CODES`; ``terrain``: the uneven ground that the base follows.
+        Raises :class:`RobotError` if MuJoCo cannot read the URDF."""
         check(spec)
         joints = len(spec.drives)
         pose = np.asarray(spec.pose, float)
@@ -53,7 +63,8 @@ class RobotBody:
         self.code = code
         self.parameters = parameters
         try:
-            self._parsed = _parse(spec, code, parameters.friction)
+            self._parsed = _parse(spec, code, parameters.friction, 0.0 if terrain is not None else float(pose[2]))
+            footprint = None if terrain is None else ground_following.footprint(self._parsed)
         except ValueError as error:
             raise build_error(spec, error) from error
         self.shapes = shapes_of_robot(spec)
@@ -80,6 +91,10 @@ class RobotBody:
         """[m] Height z of the base, which moves in a horizontal plane."""
         self.base_velocity = np.zeros(3)
         """[3] vx, vy, wz (m/s, m/s, rad/s), commanded velocity in the base's own axes."""
+        self.follower = None if terrain is None or footprint is None else GroundFollower(terrain, footprint)
+        """Lets the base follow uneven ground; None: the base moves in a plane at constant height."""
+        self._level_velocity = self.base_velocity if self.follower is None else np.zeros(3)
+        """[3] The commanded velocity seen from above, in axes with the base's yaw."""
         self.base_gains = _base_gains(spec, parameters)
         """Stiffness and damping [3] of the base's servos along x, y and about z."""
         self._base_slip = np.array([parameters.base_slip])
@@ -129,12 +144,18 @@ class RobotBody:
         """Add the robot to a world, on a planar base and with its servos."""
         given = self.spec
         name = self.spec.name
-        base = spec.worldbody.add_body(name=name, pos=[0.0, 0.0, float(given.pose[2])])
+        height = float(given.pose[2]) if self.follower is None else 0.0
+        base = spec.worldbody.add_body(name=name, pos=[0.0, 0.0, height])
         slide = mujoco.mjtJoint.mjJNT_SLIDE
         hinge = mujoco.mjtJoint.mjJNT_HINGE
         axes = zip(_PLANAR, (slide, slide, hinge), np.eye(3), strict=True)
         for axis, kind, direction in axes:
+            if kind == hinge and self.follower is not None:
+                base.add_joint(name=f"{name}:z", type=slide, axis=[0.0, 0.0, 1.0])
             base.add_joint(name=f"{name}:{axis}", type=kind, axis=direction)
+        if self.follower is not None:
+            base.add_joint(name=f"{name}:pitch", type=hinge, axis=[0.0, 1.0, 0.0])
+            base.add_joint(name=f"{name}:roll", type=hinge, axis=[1.0, 0.0, 0.0])
         spec.copy_during_attach = True
         spec.attach(self._parsed, prefix=f"{name}/", frame=base.add_frame())
         for drive, stiffness, damping in zip(given.drives, self.stiffness, self.damping, strict=True):
@@ -142,6 +163,9 @@ class RobotBody:
         stiffness, damping = self.base_gains
         for i, axis in enumerate(_PLANAR):
             _add_servo(spec, f"{name}:{axis}", stiffness[i], damping[i], given.base_effort[i // 2])
+        if self.follower is not None:
+            for axis in ground_following.AXES:  # GroundFollower.find_indices() sets the gains
+                _add_servo(spec, f"{name}:{axis}", 0.0, 0.0, ground_following.MAX_EFFORT)
 
     def find_indices(self, m: mujoco.MjModel, names: recompile.WorldNames) -> None:
         """Look up the MuJoCo indices of the robot's bodies and joints in a recompiled world."""
@@ -158,6 +182,8 @@ class RobotBody:
         self.base_actuator = np.array([names.actuator[joint] for joint in planar], int)
         mine = name + "/"
         self.bodies = {n.removeprefix(mine): i for i, n in enumerate(names.bodies) if n.startswith(mine)}
+        if self.follower is not None:
+            self.follower.find_indices(m, names, name, self.base_actuator[:2], self.spec.base_effort[0])
         self._set_gains(m)
         self._controls_of = None
 
@@ -166,6 +192,8 @@ class RobotBody:
         self.target[:] = d.qpos[self.q] = position
         self.base_target[:] = d.qpos[self.base_q] = pose[0], pose[1], frames.to_yaw(pose[3:])
         d.qvel[self.v] = d.qvel[self.base_v] = 0.0
+        if self.follower is not None:
+            self.follower.place(d, self.base_target)
         self.target_velocity[:] = self.base_velocity[:] = 0.0
         self.control[:] = self.stiffness * self.target + self.feedforward
         for joint, (source, coefficients) in self._mimics(m).items():
@@ -176,6 +204,9 @@ class RobotBody:
         """Before a step of ``dt`` [s]: compute MuJoCo's controls from the targets."""
         if self._controls_of is not d:
             self._bind_controls(d, dt)
+        if self.follower is not None:
+            self._level_velocity[:] = self.follower.level_velocity(d, self.base_velocity)
+            self.follower.apply_controls(d, d.qpos[self.base_q], d.qvel[self.base_v], dt)
         self._apply_controls()
 
     def _bind_controls(self, d: mujoco.MjData, dt: float) -> None:
@@ -198,7 +229,7 @@ class RobotBody:
             joint_servos.BaseDrive,
             stiffness=stiffness,
             damping=damping,
-            velocity=self.base_velocity,
+            velocity=self._level_velocity,
             slip=self._base_slip,
             q=self.base_q,
             actuator=self.base_actuator,
@@ -239,6 +270,16 @@ class RobotBody:
         self.sensor_links = other.sensor_links
         self.remote_wrenches = other.remote_wrenches
 
+    def base_state(self, d: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the pose [7] and the velocity [6] (world axes) of the base link."""
+        x, y, yaw = d.qpos[self.base_q].tolist()
+        vx, vy, wz = d.qvel[self.base_v].tolist()
+        if self.follower is not None:
+            return self.follower.base_state(d, (x, y, yaw), (vx, vy, wz))
+        half = 0.5 * yaw
+        pose = np.array([x, y, self.base_height, 0.0, 0.0, math.sin(half), math.cos(half)])
+        return pose, np.array([vx, vy, 0.0, 0.0, 0.0, wz])
+
     # ------------------------------------------------------------------ commands
 
     def command(self, position: np.ndarray, velocity: np.ndarray | None = None) -> None:
@@ -266,9 +307,14 @@ class RobotBody:
         yaw = frames.to_yaw(base_q[3:])
         turns = np.round((d.qpos[self.base_q[2]] - yaw) / (2.0 * np.pi))
         self.base_target[:] = base_q[0], base_q[1], yaw + 2.0 * np.pi * turns
-        c = np.cos(yaw)
-        s = np.sin(yaw)
-        self.base_velocity[:] = c * base_qd[0] + s * base_qd[1], c * base_qd[1] - s * base_qd[0], base_qd[5]
+        if self.follower is None:
+            c = np.cos(yaw)
+            s = np.sin(yaw)
+            self.base_velocity[:] = c * base_qd[0] + s * base_qd[1], c * base_qd[1] - s * base_qd[0], base_qd[5]
+        else:
+            back = frames.conjugate(base_q[3:])
+            ahead, left, _ = frames.rotate(back, base_qd[:3])
+            self.base_velocity[:] = ahead, left, frames.rotate(back, base_qd[3:])[2]
         self.base_slip = self.parameters.remote_base_slip
 
     def set_gains(
@@ -342,8 +388,9 @@ class RobotBody:
         return joints
 
 
-def _parse(given: RobotSpec, code: int, friction: float) -> mujoco.MjSpec:
-    """Returns a robot parsed from its URDF, without base and servos; its shapes have the collision ``code``."""
+def _parse(given: RobotSpec, code: int, friction: float, clearance: float) -> mujoco.MjSpec:
+    """Returns a robot parsed from its URDF, without base and servos; its shapes have the collision ``code``.
+    ``clearance``: height of the base above the ground [m]."""
     text = collision_urdf(given.urdf, frozenset(drive.joint for drive in given.drives))
     child = mujoco.MjSpec.from_string(text, assets={name: to_stl(corners) for name, corners in given.meshes.items()})
     own_friction = link_friction(given.urdf)
@@ -371,7 +418,7 @@ def _parse(given: RobotSpec, code: int, friction: float) -> mujoco.MjSpec:
             joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_TRUE
             joint.actfrcrange = [-driven[joint.name].effort, driven[joint.name].effort]
     if not given.is_copy:
-        mujoco_contacts.let_links_collide(child, given, code)
+        mujoco_contacts.let_links_collide(child, given, code, clearance)
     return child
 
 

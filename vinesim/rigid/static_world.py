@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -12,6 +13,7 @@ from vinesim.core import frames
 from vinesim.scene.materials import Material, materials_of_organs
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.scene.terrain import Terrain, tilt
 from vinesim.scene.values import RigidBox, Shape
 
 CRATE_WALL = 0.012
@@ -29,6 +31,11 @@ FIRST_FIXED_GEOM = 1
 """MuJoCo's number of the geom of the first fixed piece (piece of a pole, wire, trunk or arm). The geoms of the other
 pieces follow; the ground has number 0.
 """
+
+HEIGHT_FIELD_DEPTH = 1.0
+"""Thickness [m] of the ground below the lowest point of MuJoCo's height field. Its surface alone matters."""
+CATCHING_PLANE_DEPTH = 0.02
+"""Depth [m] of the plane beyond the height field below its lowest point, so that the plane touches nothing on it."""
 
 GROUND, FIXED, BOX, CRATE_FLOOR, FREE_BUNCH, REMOTE_HAND = (1 << bit for bit in range(6))
 """Collision bits. Free bunches collide with the thick bed of a crate, all other bodies with its thin floor. Robots do
@@ -88,15 +95,16 @@ def build_static_world(
     _set_options(spec, parameters)
     spec.nuser_geom = len(geom_user(Material.UNKNOWN))
     friction = contact_friction(parameters.friction)
-    spec.worldbody.add_geom(
-        name="ground",
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=[0, 0, 1],
-        contype=GROUND,
-        conaffinity=BOX | CRATE_FLOOR | FREE_BUNCH,
-        friction=friction,
-        userdata=geom_user(Material.SOIL),
-    )
+    ground: dict[str, Any] = {
+        "contype": GROUND,
+        "conaffinity": BOX | CRATE_FLOOR | FREE_BUNCH,
+        "friction": friction,
+        "userdata": geom_user(Material.SOIL),
+    }
+    if model.terrain is None:
+        spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], **ground)
+    else:
+        _add_height_field(spec, model.terrain, ground)
     radius = model.fixed_radius.mean(1)
     material = materials_of_organs(model.fixed_organ)
     for piece in range(len(radius)):
@@ -111,12 +119,42 @@ def build_static_world(
             margin=max(MIN_STATIC_RADIUS - float(radius[piece]), 0.0),
             userdata=geom_user(material[piece]),
         )
+    if model.terrain is not None:
+        _add_catching_plane(spec, model.terrain, ground)
     for number, box in (boxes_of(model) if boxes is None else boxes).items():
         turn = frames.to_wxyz(frames.normalize(box.pose[3:]))
         body = spec.worldbody.add_body(name=f"box/{number}", pos=box.pose[:3], quat=turn)
         body.add_freejoint(name=f"box/{number}")
         _add_crate(body, box.size, box.mass, friction)
     return spec
+
+
+def _add_height_field(spec: mujoco.MjSpec, terrain: Terrain, ground: dict[str, Any]) -> None:
+    """Add the uneven ground as a height field, whose cells MuJoCo divides into the same triangles as ``terrain``."""
+    heights = terrain.nodes()
+    low = float(heights.min())
+    rise = max(float(heights.max()) - low, 1e-3)
+    half = 0.5 * (np.array(terrain.end) - terrain.origin)
+    middle = 0.5 * (np.array(terrain.end) + terrain.origin)
+    spec.add_hfield(
+        name="ground",
+        nrow=heights.shape[0],
+        ncol=heights.shape[1],
+        size=[*half, rise, HEIGHT_FIELD_DEPTH],
+        userdata=((heights - low) / rise).ravel().tolist(),
+    )
+    kind = mujoco.mjtGeom.mjGEOM_HFIELD
+    spec.worldbody.add_geom(name="ground", type=kind, hfieldname="ground", pos=[*middle, low], **ground)
+
+
+def _add_catching_plane(spec: mujoco.MjSpec, terrain: Terrain, ground: dict[str, Any]) -> None:
+    """Add an inclined plane just below the lowest point of the height field, so that objects beyond its edge do not
+    fall for ever."""
+    along, across = terrain.slope
+    turn = frames.to_wxyz(tilt(0.0, along, across))
+    height = float(terrain.residual.min()) - CATCHING_PLANE_DEPTH
+    kind = mujoco.mjtGeom.mjGEOM_PLANE
+    spec.worldbody.add_geom(name="beyond", type=kind, size=[0, 0, 1], pos=[0.0, 0.0, height], quat=turn, **ground)
 
 
 def _set_options(spec: mujoco.MjSpec, parameters: PhysicsParameters) -> None:

@@ -20,6 +20,7 @@ import numpy as np
 from vinesim.core import frames
 from vinesim.core.array_fields import StructOfArrays, array
 from vinesim.scene.ids import Organ
+from vinesim.scene.terrain import Terrain
 
 _UNIT_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 _UNIT_QUAT = (0.0, 0.0, 0.0, 1.0)
@@ -141,11 +142,21 @@ class Model(StructOfArrays):
     """Outer length, width and height of the box."""
     box_mass: np.ndarray = array("box", unit="kg")
 
+    terrain: Terrain | None = None
+    """The uneven ground; None: the plane z = 0."""
+
+    def copy(self) -> Model:
+        """Returns a deep copy of the arrays, with the same terrain."""
+        return dataclasses.replace(super().copy(), terrain=self.terrain)
+
     def digest(self) -> str:
         """Returns a hash of all arrays (16 hex digits): two clients with equal digests hold the same vineyard."""
         h = hashlib.blake2b(digest_size=8)
         for name in self.array_fields():
             h.update(np.ascontiguousarray(getattr(self, name)).tobytes())
+        if self.terrain is not None:
+            h.update(repr((self.terrain.origin, self.terrain.cell, self.terrain.slope)).encode())
+            h.update(self.terrain.residual.tobytes())
         return h.hexdigest()
 
     def bodies_of(self, tree: int) -> slice:

@@ -1,4 +1,5 @@
-"""The content of a scene file: a vineyard's layout, season, fruit, boxes, sun, wind, and start positions of robots.
+"""The content of a scene file: a vineyard's layout, ground, season, fruit, boxes, sun, wind, and start positions of
+robots.
 
 Lengths are in metres, angles in radians, axes as in :mod:`vinesim.core.frames`. The first vine of the first row is at
 the origin; vines follow along +x, rows along +y. So a longer row or an additional row changes the position of no other
@@ -12,6 +13,8 @@ import pathlib
 from typing import Annotated, Literal
 
 import msgspec
+import numpy as np
+from PIL import Image, UnidentifiedImageError
 
 from vinesim.core.data_files import DataFileNotFound, find_data_file
 from vinesim.core.geodesy import APRILIA, Geodetic
@@ -52,6 +55,49 @@ class Layout(_Part, frozen=True, kw_only=True):
     missing: tuple[tuple[int, int], ...] = ()
     """Row and place in the row, from 0, of vines that are left out, for example to make room for imported plants. Their
     poles remain."""
+
+
+class Ruts(_Part, frozen=True, kw_only=True):
+    """Ruts that wheels have left in every alley between rows, and beside the first and the last row."""
+
+    depth: Annotated[float, msgspec.Meta(gt=0.0, le=0.4)] = 0.06
+    """[m] Depth in the middle of a rut. The default is a guess: a tractor on moist loam."""
+    width: Annotated[float, msgspec.Meta(ge=0.1, le=1.5)] = 0.35
+    """[m] Width of a rut from edge to edge."""
+    gauge: Annotated[float, msgspec.Meta(ge=0.3, le=4.0)] = 1.1
+    """[m] Distance between the two ruts of an alley, from middle to middle: the track width of a narrow tractor."""
+
+
+class Roughness(_Part, frozen=True, kw_only=True):
+    """Smooth random unevenness; the scene's seed determines it."""
+
+    deviation: Annotated[float, msgspec.Meta(gt=0.0, le=0.5)] = 0.015
+    """[m] Standard deviation of the height."""
+    wavelength: Annotated[float, msgspec.Meta(ge=0.2, le=50.0)] = 2.0
+    """[m] Shortest wavelength."""
+
+
+class TerrainTable(_Part, frozen=True, kw_only=True):
+    """Uneven ground: the sum of an inclined plane, an image of heights, ruts and roughness. Without this table the
+    ground is the plane z = 0."""
+
+    slope: Annotated[float, msgspec.Meta(ge=0.0, le=0.6)] = 0.0
+    """[1] Rise of the inclined plane over a metre; 0.1 is a slope of 10 %. The first vine stands at the height 0."""
+    direction: float = 0.0
+    """[rad] Direction in which the plane rises, from +x, counter-clockwise seen from above."""
+    ruts: Ruts | None = None
+    roughness: Roughness | None = None
+    image: str | None = None
+    """PNG file with one channel of 8 or 16 bits; black is the lowest height of ``range``, white the highest. Its first
+    row has the highest y. The folder of the scene file is searched first."""
+    range: tuple[float, float] = (0.0, 1.0)
+    """[m] Heights of black and of white."""
+    corner: tuple[float, float] | None = None
+    """[m] x and y of the image's lower left pixel; by default the image's middle is the vineyard's."""
+    cell: Annotated[float, msgspec.Meta(ge=0.02, le=2.0)] = 0.1
+    """[m] Distance between the nodes of the ground, and between the image's pixels."""
+    margin: Annotated[float, msgspec.Meta(ge=1.0, le=50.0)] = 8.0
+    """[m] Width of the headland around the vineyard with these heights; beyond it the heights of the edge continue."""
 
 
 class Season(_Part, frozen=True, kw_only=True):
@@ -181,6 +227,8 @@ class Scene(_Part, frozen=True, kw_only=True):
     plants: str = "vine"
     """File of plant parameters in ``data/plants``."""
     layout: Layout
+    terrain: TerrainTable | None = None
+    """Uneven ground; the plane z = 0 unless given."""
     season: Season = Season()
     fruit: Fruit
     boxes: tuple[Box, ...] = ()
@@ -206,6 +254,9 @@ def load_scene(path_or_name: str | pathlib.Path, seed: int | None = None) -> Sce
     scene = load_toml(path, Scene, SceneError)
     beside = [msgspec.structs.replace(one, file=str(_beside(path, one.file))) for one in scene.imported]
     scene = msgspec.structs.replace(scene, imported=tuple(beside))
+    if scene.terrain is not None and scene.terrain.image is not None:
+        image = str(_beside(path, scene.terrain.image))
+        scene = msgspec.structs.replace(scene, terrain=msgspec.structs.replace(scene.terrain, image=image))
     trouble = _find_error(scene)
     if trouble:
         raise SceneError(f"{path}: {trouble}")
@@ -246,11 +297,88 @@ def _find_error(scene: Scene) -> str:
             load_imported_plant(one.file)
         except DataError as bad:
             return f"imported[{i}].file: {bad}"
+    if trouble := _find_terrain_error(scene):
+        return trouble
     names = [s.name for s in scene.spawns]
     for i, name in enumerate(names):
         if name in names[:i]:
             return f"spawns[{i}].name is {name!r}, as spawns[{names.index(name)}].name; give each its own name"
     return ""
+
+
+MAX_NODES = 1_000_000
+"""Largest number of nodes of uneven ground."""
+MAX_SIDE_SLOPE = 1.0
+"""[1] Steepest side of a rut, 45 degrees. GUESSED: moist soil slides off steeper sides."""
+_RUT_STEEPNESS = 8.0 / (3.0 * math.sqrt(3.0))
+"""[1] Steepest slope of a rut's profile (1 - u^2)^2, in units of its depth over half its width."""
+
+
+def _find_terrain_error(scene: Scene) -> str:
+    """Check rules of the terrain that the types cannot express; see :func:`_find_error`."""
+    table = scene.terrain
+    if table is None:
+        return ""
+    layout = scene.layout
+    ruts = table.ruts
+    if ruts is not None:
+        steep = _RUT_STEEPNESS * ruts.depth / (0.5 * ruts.width)
+        if steep > MAX_SIDE_SLOPE:
+            least = _RUT_STEEPNESS * ruts.depth / (0.5 * MAX_SIDE_SLOPE)
+            return f"terrain.ruts.width is {ruts.width} m; give {least:.2f} m or more, or a depth below {ruts.depth} m"
+        if ruts.gauge + ruts.width > layout.row_spacing or ruts.width > ruts.gauge:
+            return (
+                f"terrain.ruts.gauge is {ruts.gauge} m; give {ruts.width} m (their width) or more, and at most "
+                f"{layout.row_spacing - ruts.width:.2f} m, so that ruts and rows stay apart"
+            )
+        if table.cell > ruts.width / 3.0:
+            return f"terrain.cell is {table.cell} m; give {ruts.width / 3.0:.3f} m or less, a third of a rut's width"
+    if table.roughness is not None and table.cell > 0.25 * table.roughness.wavelength:
+        most = 0.25 * table.roughness.wavelength
+        return f"terrain.cell is {table.cell} m; give {most:.3f} m or less, a quarter of the roughness' wavelength"
+    size = [
+        count * spacing + 2.0 * table.margin
+        for count, spacing in ((layout.vines, layout.vine_spacing), (layout.rows, layout.row_spacing))
+    ]
+    nodes = size[0] * size[1] / table.cell**2
+    if nodes > MAX_NODES:
+        least = math.ceil(100.0 * math.sqrt(size[0] * size[1] / MAX_NODES)) / 100.0
+        return f"terrain.cell is {table.cell} m, {nodes / 1e6:.0f} million heights; give {least:.2f} m or more"
+    low, high = table.range
+    if not -100.0 <= low < high <= 100.0:
+        return f"terrain.range is [{low}, {high}] m; give [height of black, height of white], -100 to 100 m, rising"
+    if table.image is None:
+        for key, given in (("range", table.range != (0.0, 1.0)), ("corner", table.corner is not None)):
+            if given:
+                return f"terrain.{key} is given without terrain.image; add image = ..., or remove {key}"
+        return ""
+    try:
+        load_heights(table)
+    except SceneError as bad:
+        return str(bad)
+    return ""
+
+
+def load_heights(table: TerrainTable) -> np.ndarray:
+    """Returns the heights [row, column] m of a terrain's image; the first row has the lowest y.
+
+    Raises :class:`SceneError` if the image cannot be used.
+    """
+    path = table.image
+    try:
+        with Image.open(str(path)) as image:
+            mode = image.mode
+            pixels = np.asarray(image)
+    except (OSError, UnidentifiedImageError, ValueError):
+        raise SceneError(f"terrain.image is {path!r}, which cannot be read; give a grey PNG of 8 or 16 bits") from None
+    if pixels.ndim != 2 or mode not in ("L", "I;16", "I;16B", "I") or min(pixels.shape) < 2:
+        raise SceneError(
+            f"terrain.image is {path!r} with mode {mode} and size {list(pixels.shape[1::-1])}; give a grey PNG of 8 or "
+            "16 bits with 2 x 2 pixels or more"
+        )
+    white = 255.0 if mode == "L" else 65535.0
+    low, high = table.range
+    return low + (high - low) * (pixels[::-1].astype(float) / white)
 
 
 def with_seed(scene: Scene, seed: int | None) -> Scene:

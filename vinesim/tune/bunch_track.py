@@ -8,6 +8,7 @@ at edges and has whole pixels. The peduncle, which bends, is too thin to count.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -106,8 +107,14 @@ def _opened(mask: np.ndarray, width: float) -> np.ndarray:
     """Returns the pixels of a mask without its parts that are thinner than ``width`` [pixel], holes filled."""
     reach = 0.5 * width
     mask = ndimage.binary_fill_holes(mask)
-    kept = ndimage.distance_transform_edt(mask) > reach
-    return ndimage.distance_transform_edt(~kept) <= reach if kept.any() else kept
+    kept = _depth_in(mask) > reach
+    return _depth_in(~kept) <= reach if kept.any() else kept
+
+
+def _depth_in(mask: np.ndarray) -> np.ndarray:
+    """Returns the distance [pixel] of each pixel of a mask from the nearest pixel outside of the mask."""
+    found: Any = ndimage.distance_transform_edt(mask)  # distances only, as no indices are asked for
+    return found
 
 
 def _share_by_colour(rgb: np.ndarray, core: np.ndarray) -> np.ndarray:
@@ -116,8 +123,8 @@ def _share_by_colour(rgb: np.ndarray, core: np.ndarray) -> np.ndarray:
     The colours inside ``core`` and in a ring around it give Fisher's linear discriminant; a pixel between the two means
     is covered in part.
     """
-    outside = ndimage.distance_transform_edt(~core)
-    inner = ndimage.distance_transform_edt(core) > GROWN
+    outside = _depth_in(~core)
+    inner = _depth_in(core) > GROWN
     ring = (outside > GROWN) & (outside <= GROWN + RING)
     near = outside <= GROWN
     if inner.sum() < MIN_PIXELS or ring.sum() < MIN_PIXELS:

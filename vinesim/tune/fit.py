@@ -247,14 +247,12 @@ class Fit:
     # ------------------------------------------------------------------ file
 
     def fitted_specimen(self) -> Specimen:
-        """Returns the specimen with its fitted numbers, which have the grade FITTED. Numbers that the data do not decide
-        stay as they were."""
+        """Returns the specimen with its fitted numbers. They have the grade FITTED, or GUESSED if the track does not
+        determine them: together they still swing as the track does."""
         text = f"{datetime.date.today().isoformat()}, vinesim tune of {self.track.source}"
         changes: dict[str, Any] = {}
         bow = list(self.specimen.bow)
         for e in self.estimates:
-            if not e.known:
-                continue
             told = f"{text}: 90 % {_short(e.low)} to {_short(e.high)}"
             if e.name.startswith("bow"):
                 bow["yz".index(e.name[-1])] = float(_short(e.value))
@@ -264,8 +262,9 @@ class Fit:
                 number = getattr(self.specimen, field)
                 if number is not None:
                     value = number.value * e.value if e.name == "mass" else e.value
-                    told = told + " times" * (e.name == "mass")
-                    changes[field] = _replaced(number, float(f"{value:.5g}"), told)
+                    told = told + " times" * (e.name == "mass") + "; not decided by the track" * (not e.known)
+                    grade = "FITTED" if e.known else "GUESSED"
+                    changes[field] = _replaced(number, float(f"{value:.5g}"), told, grade)
         return msgspec.structs.replace(self.specimen, bow=(bow[0], bow[1]), **changes)
 
     def write_plant(self, path: str | pathlib.Path, plant: str = "vine") -> None:
@@ -281,11 +280,11 @@ class Fit:
         keys = {"modulus": "woody_modulus" if part == "cane" else "modulus", "damping": "damping", "density": "density"}
         for field, key in keys.items():
             number = getattr(fitted, field)
-            if number.grade == "FITTED" and number is not getattr(self.specimen, field):
+            if number is not getattr(self.specimen, field):
                 if key == "woody_modulus":
                     text = _scale_green(text, number)
                 text = _replace_line(text, part, key, number)
-        if part == "peduncle" and fitted.tip_mass is not None and fitted.tip_mass.grade == "FITTED":
+        if part == "peduncle" and fitted.tip_mass is not None and fitted.tip_mass is not self.specimen.tip_mass:
             text = _replace_line(text, "bunch", "mass", fitted.tip_mass)
         with writing(path):
             pathlib.Path(path).write_text(text + "\n" + specimen_toml(fitted), encoding="utf-8")
@@ -325,8 +324,8 @@ def _number(number: Any) -> str:
     )
 
 
-def _replaced(number: Any, value: float, source: str) -> Any:
-    return msgspec.structs.replace(number, value=value, grade="FITTED", source=source)
+def _replaced(number: Any, value: float, source: str, grade: str) -> Any:
+    return msgspec.structs.replace(number, value=value, grade=grade, source=source)
 
 
 def _replace_line(text: str, table: str, key: str, number: Any) -> str:
@@ -345,14 +344,17 @@ def _scale_green(text: str, woody: Any) -> str:
     ]
     source = f"as far below the woody modulus as before; {woody.source}"
     return _replace_line(
-        text, "cane", "green_modulus", _replaced(woody, float(f"{woody.value * values[1] / values[0]:.5g}"), source)
+        text,
+        "cane",
+        "green_modulus",
+        _replaced(woody, float(f"{woody.value * values[1] / values[0]:.5g}"), source, woody.grade),
     )
 
 
 def _rounded(value: float, gap: float) -> str:
     """Returns a number with four digits, or with as many as tell it from a number at the distance ``gap``."""
-    digits = math.ceil(math.log10(abs(value) / gap)) + 1 if value and gap > 0.0 else 4
-    return f"{value:.{min(max(digits, 4), 9)}g}"
+    digits = math.floor(math.log10(abs(value))) - math.floor(math.log10(gap)) + 1 if value and gap > 0.0 else 4
+    return f"{value:#.{min(max(digits, 4), 9)}g}".rstrip(".")
 
 
 def _short(value: float) -> str:

@@ -41,6 +41,9 @@ class Posterior:
     names: tuple[str, ...]
     mean: np.ndarray
     covariance: np.ndarray
+    """[parameter, parameter] of noise and systematic errors together."""
+    systematic: np.ndarray
+    """[parameter, parameter] The part of the covariance that comes from systematic errors of the tracker."""
     physical: int
     """Number of parameters that describe the plant. These are the first ones; the remaining parameters describe the
     experiment."""
@@ -99,6 +102,7 @@ def laplace(problem: Problem, theta: np.ndarray, found: Evaluation, noise: np.nd
         problem.names,
         theta.copy(),
         covariance,
+        bent.sum(0),
         len(problem.fitted),
         _ridges(problem, columns.sum(0) + gauge, prior),
         correlation_time,
@@ -222,13 +226,15 @@ def importance_sample(
     """Sample the exact posterior: sample ``count`` parameter sets at random from a proposal distribution, simulate
     them, and resample them with the weights posterior / proposal.
 
-    The proposal is a Student t distribution with five degrees of freedom and the mean and covariance of ``posterior``.
+    The proposal is a Student t distribution with five degrees of freedom and the mean and covariance of ``posterior``
+    without systematic errors. These are not in the likelihood: each sample is moved by one of them at the end.
     ``noise``: [column] standard deviation of the track [m]. ``seed``: seed of the random numbers. ``batch``: number of
     parameter sets that are simulated at once.
     """
     rng = np.random.default_rng(seed)
     size = len(posterior.mean)
-    root = np.linalg.cholesky(posterior.covariance + 1e-15 * np.diag(np.diag(posterior.covariance)))
+    independent = posterior.covariance - posterior.systematic
+    root = np.linalg.cholesky(independent + 1e-15 * np.diag(np.diag(independent)))
     freedom = 5.0
     normal = rng.normal(size=(count, size))
     stretch = np.sqrt(freedom / rng.chisquare(freedom, count))
@@ -245,4 +251,6 @@ def importance_sample(
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
     chosen = np.searchsorted(np.cumsum(weight), (rng.random() + np.arange(count)) / count)
-    return Sample(thetas[np.minimum(chosen, count - 1)], float(1.0 / (weight**2).sum()))
+    values, vectors = np.linalg.eigh(posterior.systematic)
+    shift = rng.normal(size=(count, size)) * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
+    return Sample(thetas[np.minimum(chosen, count - 1)] + shift, float(1.0 / (weight**2).sum()))

@@ -17,6 +17,7 @@ import numpy as np
 
 from vinesim.core import frames
 from vinesim.scene.model import Model
+from vinesim.scene.terrain import above_ground
 
 ATTENUATION = 0.4
 """[1] Attenuation coefficient of the exponential profile in the canopy. GUESSED: used for orchards; cereals have 2 to
@@ -67,10 +68,11 @@ class TreeDrag:
         centre[has] = np.add.reduceat(area[:, None] * point, first)[has] / total[has, None]
         if not has.any():
             return cls(total, centre, np.ones(len(first)), MIN_DEPTH)
-        order = np.argsort(point[:, 2], kind="stable")
+        height = above_ground(model.terrain, point)
+        order = np.argsort(height, kind="stable")
         share = np.cumsum(area[order]) / area.sum()
-        low, top = (float(point[order[np.searchsorted(share, part)], 2]) for part in (0.05, 0.95))
-        square = height_profile(point[:, 2], max(top, MIN_DEPTH)) ** 2
+        low, top = (float(height[order[np.searchsorted(share, part)]]) for part in (0.05, 0.95))
+        square = height_profile(height, max(top, MIN_DEPTH)) ** 2
         profile = np.sqrt(np.add.reduceat(area * square, first) / np.where(has, total, 1.0))
         return cls(total, centre, profile, max(top - low, MIN_DEPTH))
 

@@ -17,6 +17,7 @@ from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.wires import elastic_supports as kernels
 from vinesim.plants.articulation_solver import ArticulationSolver, spans
 from vinesim.plants.equilibrium import EquilibriumFinder
+from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 
 WAKE_SHARE = 0.25
@@ -235,6 +236,28 @@ class ElasticSupports:
         self.is_coupled[pairs[1, shared[pairs[0]]]] = True
 
 
+def _along_wires(model: Model, ties: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns for ties [k] to wires: unit vectors [k, 3] along the pieces of wire, the length [k] m of each piece, and
+    the distance [k] m of the tie from its start."""
+    piece = model.tie_wire[ties]
+    start = model.fixed_start[piece].astype(float)
+    way = (model.fixed_end - model.fixed_start)[piece].astype(float)
+    length = np.linalg.norm(way, axis=1)
+    axis = way / length[:, None]
+    return axis, length, np.clip(((model.tie_anchor[ties] - start) * axis).sum(1), 0.0, length)
+
+
+def wire_compliance(model: Model) -> np.ndarray:
+    """Returns the compliance [tie] m/N across the wire of the wire at each tie, while no other tie loads it; 0 for an
+    anchor that does not move."""
+    compliance = np.zeros(len(model.tie_body))
+    tied = np.flatnonzero((model.tie_wire >= 0) & (model.fixed_tension[model.tie_wire] > 0.0))
+    _, length, along = _along_wires(model, tied)
+    tension = model.fixed_tension[model.tie_wire[tied]].astype(float)
+    compliance[tied] = along * (length - along) / (length * tension)
+    return compliance
+
+
 def _wire_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
     """Returns the nodes of wires as arrays by name. A node is a tie of a shoot to a wire under tension. Nodes are
     sorted by wire and along each wire.
@@ -242,11 +265,7 @@ def _wire_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
     model = plants.model
     tied = plants.ties.on_wire
     piece = model.tie_wire[tied]
-    start = model.fixed_start[piece].astype(float)
-    way = (model.fixed_end - model.fixed_start)[piece].astype(float)
-    length = np.linalg.norm(way, axis=1)
-    axis = way / length[:, None]
-    along = np.clip(((model.tie_anchor[tied] - start) * axis).sum(1), 0.0, length)
+    axis, length, along = _along_wires(model, tied)
     order = np.lexsort((along, piece))
     tie = tied[order]
     tension = model.fixed_tension[piece[order]].astype(float)
@@ -264,11 +283,10 @@ def _wire_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
     }
 
 
-def _arm_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
-    """Returns the nodes of arms as arrays by name. A node is the root of a tree that stands on an elastic arm. Nodes
-    are sorted by arm and along each arm.
-    """
-    model = plants.model
+def arm_compliance(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Returns for the roots on arms that twist: body [k]; torsional compliance [k] rad/(N m) of the arm from its clamp
+    to the root, and of the whole arm; axis [k, 3] of the arm in the middle axes of the root's joint in the drawn
+    shape."""
     pieces = np.flatnonzero(model.arm_is_elastic())
     tree = np.flatnonzero(model.is_on_arm())
     body = model.tree_first[tree]
@@ -280,8 +298,7 @@ def _arm_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
     thick, thin = model.fixed_radius[pieces].astype(float).T
     modulus = model.fixed_shear_modulus[pieces].astype(float)
     twist = _twist(length, thick, thin, modulus)
-    arm = model.fixed_index[pieces]
-    _, first, number = np.unique(arm, return_index=True, return_inverse=True)
+    _, first, number = np.unique(model.fixed_index[pieces], return_index=True, return_inverse=True)
     before = np.cumsum(twist) - twist
     before -= before[first][number]  # the pieces of an arm are adjacent
     along = np.clip(((model.tree_pose[tree, :3] - start[here]) * axis).sum(1), 0.0, length[here])
@@ -291,18 +308,29 @@ def _arm_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
     joint = frames.multiply(model.tree_pose[tree, 3:].astype(float), model.body_rest[body].astype(float))
     # the torque of a spring acts in the middle axes
     axis = frames.rotate(frames.conjugate(frames.multiply(joint, frames.exp(0.5 * drawn))), axis)
-    order = np.lexsort((compliance, arm[here]))
+    return body, compliance, np.bincount(number, twist)[number][here], axis
+
+
+def _arm_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
+    """Returns the nodes of arms as arrays by name. A node is the root of a tree that stands on an elastic arm. Nodes
+    are sorted by arm and along each arm.
+    """
+    model = plants.model
+    body, compliance, whole, axis = arm_compliance(model)
+    tree = model.body_tree[body]
+    arm = model.fixed_index[model.tree_piece[tree]]
+    order = np.lexsort((compliance, arm))
     nodes = {
-        "support": len(model.fixed_start) + arm[here],
+        "support": len(model.fixed_start) + arm,
         "tie": np.full(len(tree), -1),
         "is_arm": np.ones(len(tree), bool),
         "axis": axis,
         "body": body.astype(np.int32),
         "point": np.zeros((len(tree), 3)),
-        "origin": drawn,
+        "origin": frames.log(model.joint_settled[body].astype(float)),
         "response": _tip_response(plants, tree, axis),
         "compliance": compliance,
-        "whole": np.bincount(number, twist)[number][here],
+        "whole": whole,
     }
     return {name: value[order] for name, value in nodes.items()}
 

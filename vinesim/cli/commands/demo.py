@@ -31,7 +31,7 @@ def demo(
     ] = None,
     robot: Annotated[
         str | None,
-        typer.Option(help="A URDF file, or the name of a shipped robot; by default vinebot, or logistic to exchange."),
+        typer.Option(help="A robot file, or the name of a shipped robot; by default vinebot, or logistic to exchange."),
     ] = None,
     device: Device = "cpu",
     real_time_factor: RealTimeFactor = None,

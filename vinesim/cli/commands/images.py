@@ -1,4 +1,4 @@
-"""``vinesim scene show``, ``vinesim render`` and ``vinesim dataset``: their options."""
+"""``vinesim scene show``, ``vinesim export``, ``vinesim render`` and ``vinesim dataset``: their options."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from vinesim.cli.commands.options import Camera, Device, ImageSize, Scene, Seed,
 
 
 def scene_show(
-    file: Annotated[str, typer.Argument(help="A scene file, or demo, harvest, tendone, vsp.")],
+    file: Annotated[str, typer.Argument(help="A scene file, or demo, harvest, slope, tendone, vsp.")],
     seed: Seed = None,
     out: Annotated[pathlib.Path | None, typer.Option(help="Picture to write; by default NAME.png.")] = None,
 ) -> None:
@@ -67,8 +67,35 @@ def scene_import_plant(
     raise typer.Exit(code)
 
 
-def render(
+def export(
     scene: Annotated[str, typer.Argument(help="A scene file, or demo, harvest, tendone, vsp.")],
+    out: Annotated[
+        pathlib.Path,
+        typer.Option(help="File to write; its suffix chooses the format: .xml (MJCF), .urdf, .usda, .usdc or .usd."),
+    ],
+    seed: Seed = None,
+    leaves: Annotated[
+        bool, typer.Option("--leaves", help="Draw the leaves. They do not collide, and make the file twice as large.")
+    ] = False,
+) -> None:
+    """Write a vineyard for another simulator: bodies on hinges with springs, wood, wires, ground, boxes.
+
+    Masses, the equilibrium under gravity and the frequencies of small vibrations are those of vinesim. A URDF has the
+    springs as elements that Gazebo alone reads. OpenUSD needs vinesim[export].
+
+    \b
+    Examples:
+      vinesim export demo --out vineyard.xml
+      vinesim export vsp --seed 4 --out vsp.usdc
+      vinesim export my-block.toml --leaves --out block.urdf
+    """
+    from vinesim.cli.scene import export_scene
+
+    raise typer.Exit(export_scene(scene, seed, out, leaves))
+
+
+def render(
+    scene: Annotated[str, typer.Argument(help="A scene file, or demo, harvest, slope, tendone, vsp.")],
     at: Annotated[str | None, typer.Option(help="Position of the camera, X,Y,Z [m].")] = None,
     look: Annotated[str | None, typer.Option(help="The point it looks at, X,Y,Z [m].")] = None,
     path: Annotated[
@@ -162,17 +189,29 @@ def dataset(
     actors: Annotated[
         float, typer.Option(help="Share of the images with people, robots, crates and wind; 0: vines only.")
     ] = 0.4,
+    negatives: Annotated[
+        float, typer.Option(help="Share of the images in which no bunch is visible, with empty labels.")
+    ] = 0.0,
+    segmentation: Annotated[
+        str, typer.Option(help="Masks in COCO: polygons, rle (a list of run lengths) or compressed (RLE as text).")
+    ] = "polygons",
+    yolo: Annotated[
+        str, typer.Option(help="Labels for YOLO: detect (boxes), segment (polygons) or pose (boxes and cut points).")
+    ] = "detect",
+    semantic: Annotated[bool, typer.Option("--semantic", help="Write an image of each pixel's class, too.")] = False,
 ) -> None:
     """Render random pictures of random vineyards with their ground truth: COCO with masks, YOLO, depth, ids, poses.
 
     Seed of the vines, leaves, varieties, ripeness, hour and season of the sun, actors and the viewpoint are random.
     After an interruption the same command continues, and renders deleted or truncated images again. A later run may
-    ask for more images; fewer are refused. The five images of a vineyard are in one split. Of every ten
+    ask for more images; fewer are refused. It may also ask for other masks and labels, which are made without
+    rendering. The five images of a vineyard are in one split. Of every ten
     vineyards the second is for validation and the third for tests; the others are for training.
 
     \b
     Examples:
       vinesim dataset --images 1000 --out grapes
+      vinesim dataset --images 1000 --out grapes --yolo segment
       vinesim dataset --images 100000 --out /shared/grapes --scheduler tcp://HOST:8786
       vinesim dataset --images 200 --out vsp --scene vsp --seed 3 --camera pinhole --size 320x240 --workers 4
     """

@@ -17,6 +17,7 @@ from vinesim.client.programs import START_TIMEOUT, Program, ProgramGroup, RosLis
 from vinesim.core.errors import writing
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
+from vinesim.robot.description.source import kept_robot_file
 from vinesim.ros import middleware
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene, with_seed
@@ -64,6 +65,8 @@ def run_push(
     for folder in (out, out / PICKER, out / VISITOR):
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
+    with writing(out):
+        robot = kept_robot_file(robot, description, out)
     (out / "summary.json").unlink(missing_ok=True)
     no_ros = middleware.unavailable_reason()
     if no_ros:

@@ -16,6 +16,7 @@ from vinesim.client.tasks.planning import UnknownTask, plan_meeting
 from vinesim.client.tasks.start_poses import bunch_centres, start_pose
 from vinesim.core.errors import writing
 from vinesim.robot.description.loader import load_description
+from vinesim.robot.description.source import kept_robot_file
 from vinesim.ros import middleware
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import Scene, load_scene, with_seed
@@ -51,9 +52,10 @@ def run_job(
     robot = robot or default_robot
     scene = scene or "harvest"
     plan = with_seed(load_scene(scene), seed)
-    load_description(robot)  # raise errors before any process starts
+    description = load_description(robot)  # raise errors before any process starts
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
+        robot = kept_robot_file(robot, description, out)
     (out / "summary.json").unlink(missing_ok=True)
     with program_group() as group:
         server, endpoint = group.start_server(real_time_factor)

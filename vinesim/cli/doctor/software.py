@@ -24,6 +24,7 @@ EXTRAS = {
     "tune": "fits",
     "tiago": "the robot tiago_pro",
     "perception": "point clouds from depth",
+    "export": "export to OpenUSD",
     "voice": "voices",
 }
 """Extras of the package that users may install, with their purpose."""

@@ -24,6 +24,7 @@ from vinesim.scene.berries import VARIETIES
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.scene.terrain import Terrain, on_ground
 from vinesim.scene.values import HumanSpec, Snapshot
 from vinesim.sensors.primitives.scene_primitives import rest_snapshot
 
@@ -83,10 +84,11 @@ class CratePlacement:
     size: tuple[float, float, float] = (0.6, 0.4, 0.24)
     """Outer length, width, height [m]."""
 
-    @property
-    def pose(self) -> np.ndarray:
-        """Pose [7] of the crate in the world."""
-        return _ground_pose(self.x, self.y, self.yaw)
+    def pose(self, terrain: Terrain | None) -> np.ndarray:
+        """Returns the pose [7] of the crate in the world."""
+        if terrain is None:
+            return _ground_pose(None, self.x, self.y, self.yaw)
+        return terrain.resting_pose(self.x, self.y, self.yaw, (0.5 * self.size[0], 0.5 * self.size[1]))
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -117,7 +119,7 @@ class SceneComposer:
     def with_crates(self, model: Model) -> Model:
         """Returns the model with the crates added after its own boxes."""
         count = len(self.crates)
-        pose = np.array([c.pose for c in self.crates])
+        pose = np.array([c.pose(model.terrain) for c in self.crates])
         size = np.array([c.size for c in self.crates])
         return dataclasses.replace(
             model,
@@ -136,12 +138,13 @@ class SceneComposer:
 
     def _add_actors(self, rigid: RigidWorld) -> None:
         """Add robots and people. Raises :class:`PlacementError` if one overlaps something."""
+        terrain = rigid.model.terrain
         for index, one in enumerate(self.robots):
-            pose = _ground_pose(one.x, one.y, one.yaw)
+            pose = _ground_pose(terrain, one.x, one.y, one.yaw)
             rigid.add_robot(load_description(one.robot).to_spec(f"robot_{index}", index=index, pose=pose))
         for index, one in enumerate(self.people):
             pose = appearance.apply_posture(
-                standing_pose(_ground_pose(one.x, one.y, one.yaw), one.height), one.posture, one.height
+                standing_pose(_ground_pose(terrain, one.x, one.y, one.yaw), one.height), one.posture, one.height
             )
             rigid.add_human(HumanSpec(f"person_{index}", index, pose, one.height))
         _check_clearance(rigid)
@@ -159,8 +162,8 @@ class SceneComposer:
         return records
 
 
-def _ground_pose(x: float, y: float, yaw: float) -> np.ndarray:
-    return frames.pose(np.array([x, y, 0.0]), frames.from_yaw(yaw))
+def _ground_pose(terrain: Terrain | None, x: float, y: float, yaw: float) -> np.ndarray:
+    return on_ground(terrain, frames.pose(np.array([x, y, 0.0]), frames.from_yaw(yaw)))
 
 
 def bunch_masses(model: Model) -> np.ndarray:
@@ -172,6 +175,7 @@ def fill_crate(physics: Physics, number: int, crate: CratePlacement) -> list[int
     """Let the bunches nearest to a crate fall into it until its ``fill`` is reached. Returns their indices."""
     model = physics.model
     rigid = physics.rigid
+    pose = crate.pose(model.terrain)
     inside = np.array(crate.size) - [2.0 * CRATE_WALL, 2.0 * CRATE_WALL, CRATE_WALL]
     wanted = crate.fill * HEAP_DENSITY * float(np.prod(inside))
     where = physics.state.body_q[model.bunch_body, :3]
@@ -191,14 +195,12 @@ def fill_crate(physics: Physics, number: int, crate: CratePlacement) -> list[int
             if physics.state.bunch_attached[bunch]:
                 physics.pick(bunch)
             top = max([CRATE_WALL, *(_top_height(physics, other) for other in inside_it)])
-            rigid.place_bunch(
-                bunch, frames.compose(crate.pose, _drop_pose(model, bunch, inside, top, rng)), np.zeros(6)
-            )
+            rigid.place_bunch(bunch, frames.compose(pose, _drop_pose(model, bunch, inside, top, rng)), np.zeros(6))
             inside_it.append(bunch)
             _step_rigid(rigid, FALL_STEPS)
         _step_rigid(rigid, SETTLE_STEPS)
-        middle = {bunch: _rachis_ends(physics, bunch).mean(0) - crate.pose[:3] for bunch in inside_it}
-        level = {bunch: frames.rotate(frames.conjugate(crate.pose[3:]), at)[:2] for bunch, at in middle.items()}
+        middle = {bunch: _rachis_ends(physics, bunch).mean(0) - pose[:3] for bunch in inside_it}
+        level = {bunch: frames.rotate(frames.conjugate(pose[3:]), at)[:2] for bunch, at in middle.items()}
         waiting = [bunch for bunch, at in level.items() if (np.abs(at) > 0.5 * inside[:2]).any()]
         inside_it = [bunch for bunch in inside_it if bunch not in waiting]
         if not waiting:

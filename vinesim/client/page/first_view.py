@@ -7,6 +7,7 @@ import numpy as np
 from vinesim.client.spectator import FOLLOW_DISTANCE, FOLLOW_YAW, standing_view
 from vinesim.core import frames
 from vinesim.scene.model import Model
+from vinesim.scene.terrain import Terrain
 
 NEAR = 3.0
 """Distance from the nearest tree below which an actor is viewed over its shoulder [m]. GUESSED."""
@@ -50,31 +51,32 @@ def first_view(root: np.ndarray, model: Model, bodies: np.ndarray) -> np.ndarray
     if not len(distances) or distances.min() < NEAR:
         ahead = frames.rotate(root[3:], np.array([1.0, 0.0, 0.0]))
         heading = np.arctan2(ahead[1], ahead[0])
-        views = [_behind(root, heading + yaw, root[:2]) for yaw in YAWS]
+        views = [_behind(model.terrain, root, heading + yaw, root[:2]) for yaw in YAWS]
         near = _within(bodies, root[:2], FOLLOW_DISTANCE + HIDING)
         return min(views, key=lambda view: _hiding(view, root, near))
     nearest = model.tree_pose[np.argmin(distances), :2]
     vines = model.tree_pose[np.linalg.norm(model.tree_pose[:, :2] - nearest, axis=1) < AROUND, :2].mean(0)
     near = _within(bodies, vines, max(BEFORE_VINES) + LARGE)
-    views = [view for view in _before(vines) if _shows(view, root, near)]
+    views = [view for view in _before(model.terrain, vines) if _shows(view, root, near)]
     if views:
         return max(views, key=lambda view: _columns_with_vines(view, near))
     way = vines - root[:2]
-    return _behind(root, np.arctan2(way[1], way[0]) + BESIDE, vines)
+    return _behind(model.terrain, root, np.arctan2(way[1], way[0]) + BESIDE, vines)
 
 
-def _behind(root: np.ndarray, heading: float, target: np.ndarray) -> np.ndarray:
+def _behind(terrain: Terrain | None, root: np.ndarray, heading: float, target: np.ndarray) -> np.ndarray:
     """Returns the pose [7] of eyes behind an actor at ``root`` [7], looking at ``target`` [2] m.
 
     ``heading`` [rad]: direction from the eyes to the actor.
     """
-    return _looking(root[:2] - FOLLOW_DISTANCE * np.array([np.cos(heading), np.sin(heading)]), target)
+    eye = root[:2] - FOLLOW_DISTANCE * np.array([np.cos(heading), np.sin(heading)])
+    return _looking(terrain, eye, target)
 
 
-def _before(vines: np.ndarray) -> list[np.ndarray]:
+def _before(terrain: Terrain | None, vines: np.ndarray) -> list[np.ndarray]:
     """Returns poses [7] of eyes in all directions around the point ``vines`` [2] m, looking at it."""
     return [
-        _looking(vines + distance * np.array([np.cos(angle), np.sin(angle)]), vines)
+        _looking(terrain, vines + distance * np.array([np.cos(angle), np.sin(angle)]), vines)
         for distance in BEFORE_VINES
         for angle in np.linspace(0.0, 2.0 * np.pi, BEARINGS, endpoint=False)
     ]
@@ -85,9 +87,9 @@ def _within(points: np.ndarray, place: np.ndarray, distance: float) -> np.ndarra
     return points[np.linalg.norm(points[:, :2] - place, axis=1) < distance]
 
 
-def _looking(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
+def _looking(terrain: Terrain | None, eye: np.ndarray, target: np.ndarray) -> np.ndarray:
     x, y = target - eye
-    return standing_view(float(eye[0]), float(eye[1]), float(np.arctan2(y, x)))
+    return standing_view(float(eye[0]), float(eye[1]), float(np.arctan2(y, x)), terrain)
 
 
 def _shows(view: np.ndarray, root: np.ndarray, bodies: np.ndarray) -> bool:

@@ -23,6 +23,7 @@ from vinesim.rigid.human_posture import SIDES
 from vinesim.scene.appearance import load_human_model, load_shears
 from vinesim.scene.ids import Organ, object_name
 from vinesim.scene.model import Model
+from vinesim.scene.terrain import Terrain
 from vinesim.scene.values import INTENTIONS, CameraMount, Contact, Haptic, RigidVisual, SegmentPoses, Snapshot
 from vinesim.sensors.camera.exposure import usual_exposure
 from vinesim.sensors.camera.sunlight import OutdoorLight
@@ -243,6 +244,7 @@ class PageWorld:
         ground = primitives.materials
         model = self._client.model
         sun = scene.sun.direction(0.0)
+        grid, nodes = _terrain_grid(model.terrain)
         start = self._start_view()
         reach, plants = _nearest(primitives, start[:3], self._most)
         return array_message.encode(
@@ -259,6 +261,7 @@ class PageWorld:
                 "interest": self._client.replicator.interest_radius,
                 "ground": [float(ground.ground_x), float(ground.ground_y), float(ground.ground_cell)],
                 "ground_columns": int(ground.ground_sky.shape[1]),
+                "terrain": grid,
                 "person": None if self._person is None else self._client.name,
                 "is_controlled": self._person is not None and self._driver is not None,
                 "mouth": None if self._person is None else load_shears().mouth[:3].tolist(),
@@ -277,6 +280,7 @@ class PageWorld:
                 "noise": _bytes(textures.noise_texture()),
                 "leaf": _bytes(leaf),
                 "ground_sky": ground.ground_sky.numpy(),
+                "terrain": nodes,
                 "start": np.asarray(start, np.float32),
             }
             | ({} if self._person is None else _within_reach(model)),
@@ -447,6 +451,21 @@ class PageWorld:
             else:
                 roots.append(client.physics.rigid.base_state(name)[0])
         return min(roots, key=lambda root: float(np.linalg.norm(root[:2] - client.pose[:2])), default=None)
+
+
+MAX_TERRAIN_NODES = 250_000
+"""Largest number of nodes of uneven ground in a page; finer ground is sent with every second, third ... node."""
+
+
+def _terrain_grid(terrain: Terrain | None) -> tuple[dict[str, Any] | None, np.ndarray]:
+    """Returns the grid of uneven ground as a page needs it, and the heights of its nodes above its inclined plane."""
+    if terrain is None:
+        return None, np.zeros(0, np.float32)
+    stride = int(np.ceil(np.sqrt(terrain.residual.size / MAX_TERRAIN_NODES)))
+    nodes = terrain.residual[::stride, ::stride]
+    x, y = terrain.origin
+    cell = stride * terrain.cell
+    return {"x": x, "y": y, "cell": cell, "columns": nodes.shape[1], "slope": list(terrain.slope)}, nodes.ravel()
 
 
 def _light(height: float) -> dict[str, Any]:

@@ -92,7 +92,7 @@ class RosProcess:
         self._records = StepRecords(name, description, series_stiffness(description.drives))
         config = RosConfig(
             name,
-            description.urdf,
+            description.ros_urdf or description.urdf,
             description.base,
             namespace,
             clock,
@@ -140,7 +140,7 @@ class RosProcess:
         """
         self.client = client
         self.robot = robot or client.robot
-        self.worker.wait_until_ready(START_TIMEOUT)
+        self.wait_until_ready()
         client.post_step.append(self._after_step)
         client.wake_readers.append(self._wake)
         client.holds.append(self.held)
@@ -159,6 +159,10 @@ class RosProcess:
         if self._leads:
             self._simulation = SimulationControl(client, lambda reply: self.worker.send("simulated", reply))
             client.between_steps.append(self._simulation)
+
+    def wait_until_ready(self) -> None:
+        """Wait until the process is ready. Raises :class:`WorkerError` if the process fails."""
+        self.worker.wait_until_ready(START_TIMEOUT)
 
     # ------------------------------------------------------------------ in the loop
 

@@ -10,6 +10,7 @@ from vinesim.client.client import Client
 from vinesim.client.processes.ros_process import TRUTH_ORGANS
 from vinesim.client.processes.ros_worker import truth_frame
 from vinesim.core import frames
+from vinesim.robot.description.shown import shown_urdf
 from vinesim.robot.drives.robot_instance import RemoteRobot
 from vinesim.ros.world_node import WorldNode
 from vinesim.scene.ids import Organ
@@ -39,7 +40,7 @@ class RosReplay:
             if isinstance(robot, RemoteRobot):
                 one = robot.description
                 fixed = [(p, c, q) for (p, c), q in zip(one.fixed_frames, one.fixed_poses, strict=True)]
-                self._node.publish_robot(name, one.urdf, one.base, fixed, robot.sample(time))
+                self._node.publish_robot(name, shown_urdf(one), one.base, fixed, robot.sample(time))
         if client.physics.tick % self._period == 0:
             self._publish_environment(client, time)
 

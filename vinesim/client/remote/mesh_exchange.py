@@ -28,8 +28,9 @@ from vinesim.net.codec.meshes import (
     encode_request,
 )
 from vinesim.net.transport.bus import Bus
-from vinesim.robot.description.meshes import list_meshes, read_triangles
+from vinesim.robot.description.meshes import list_meshes
 from vinesim.scene import triangles
+from vinesim.scene.appearance.mesh_files import read_triangles
 
 log = logging.getLogger(__name__)
 

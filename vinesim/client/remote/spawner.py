@@ -20,6 +20,7 @@ from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.description.sidecar import decode_sidecar, encode_sidecar
+from vinesim.robot.description.source import is_shipped
 from vinesim.robot.description.urdf import DescriptionError
 from vinesim.robot.drives.robot_instance import RemoteRobot
 from vinesim.scene.values import HumanSpec, HumanUpdate, RobotSpec, RobotUpdate
@@ -264,9 +265,10 @@ def resolve_description(
         return own
     name = hello.robot if is_valid_name(hello.robot) else "robot"  # untrusted input that becomes a file name
     try:
-        known = load_description(name)
-        if is_same(known):
-            return known
+        if is_shipped(name):  # no other name: it could be that of a pipe, or of any file
+            known = load_description(name)
+            if is_same(known):
+                return known
     except DescriptionError:
         pass
     sidecar = decode_sidecar(hello.sidecar)

@@ -27,6 +27,7 @@ from vinesim.ros.commands.types import (
     Spawnable,
 )
 from vinesim.scene.ids import ObjectKind, object_id
+from vinesim.scene.terrain import on_ground
 from vinesim.scene.values import HumanSpec, RigidBox
 
 BOX_SIZE = (0.6, 0.4, 0.24)
@@ -160,7 +161,7 @@ class WorldEditor:
             numbers = itertools.count(len(self._client.model.box_size))
             one = _Spawned(EntityCategory.DYNAMIC_OBJECT, next(i for i in numbers if i not in taken), pose)
         elif scheme == _PERSON_URI:
-            one = _Spawned(EntityCategory.HUMAN, -1, _upright(pose))
+            one = _Spawned(EntityCategory.HUMAN, -1, self._upright(pose))
         else:
             one = _Spawned(EntityCategory.OBJECT, bunch, pose)
         self._add(name, one)
@@ -193,14 +194,14 @@ class WorldEditor:
         client = self._client
         rigid = self._client.physics.rigid
         if entity.category is EntityCategory.ROBOT:
-            rigid.place_robot(given.name, _upright(pose), rigid.joint_state(given.name)[0].copy())
+            rigid.place_robot(given.name, self._upright(pose), rigid.joint_state(given.name)[0].copy())
             client.robots[given.name].stop()
         elif entity.category is EntityCategory.HUMAN:
             if given.name not in self._spawned:
                 raise RequestRefused(
                     Refusal.UNSUPPORTED, f"person {given.name!r} belongs to another client, which moves it"
                 )
-            self._stand(given.name, _upright(pose))
+            self._stand(given.name, self._upright(pose))
         else:
             velocity = np.zeros(6) if given.velocity is None else np.nan_to_num(given.velocity, posinf=0.0, neginf=0.0)
             client.objects.forget(object_id(*number))
@@ -304,6 +305,11 @@ class WorldEditor:
             physics.pick(one.number)
             physics.support_tracker.set_state(object_id(ObjectKind.BUNCH, one.number), one.pose, np.zeros(6))
 
+    def _upright(self, pose: np.ndarray) -> np.ndarray:
+        """Returns the pose on the ground with the same x, y and yaw."""
+        level = frames.pose(np.array([pose[0], pose[1], 0.0]), frames.from_yaw(frames.to_yaw(pose[3:])))
+        return on_ground(self._client.model.terrain, level)
+
     def _stand(self, name: str, root: np.ndarray) -> None:
         """Place a spawned person standing at ``root`` [7]."""
         pose = standing_pose(root, PERSON_HEIGHT)
@@ -325,8 +331,3 @@ def _checked_pose(pose: np.ndarray | None) -> np.ndarray:
     if abs(float(np.linalg.norm(pose[3:])) - 1.0) > 1e-3:
         raise RequestRefused(Refusal.INVALID_POSE, f"quaternion {pose[3:].tolist()}; give one of length 1")
     return frames.pose(pose[:3], frames.normalize(pose[3:]))
-
-
-def _upright(pose: np.ndarray) -> np.ndarray:
-    """Returns the pose on the ground with the same x, y and yaw."""
-    return frames.pose(np.array([pose[0], pose[1], 0.0]), frames.from_yaw(frames.to_yaw(pose[3:])))

@@ -19,6 +19,7 @@ from vinesim.robot.tasks.swap_boxes import SwapBoxes, SwapPlan
 from vinesim.robot.tasks.task import Task
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
+from vinesim.scene.terrain import above_ground, on_ground
 from vinesim.world import Physics
 
 # Paths of a base on the ground around posts, trunks, wires and boxes: A* on a grid, then straightened.
@@ -195,9 +196,10 @@ def _base_poses(model: Model, near: np.ndarray, min_clearance: float) -> Iterato
     body_q = model.forward_kinematics(model.joint_settled)[model.bunch_body]
     axis = frames.rotate(body_q[:, 3:], np.array([1.0, 0.0, 0.0]))
     hold = body_q[:, :3] + GRASP_DEPTH * axis
+    height = above_ground(model.terrain, hold)
     fits = (
-        (hold[:, 2] > GRASP_HEIGHT[0])
-        & (hold[:, 2] < GRASP_HEIGHT[1])
+        (height > GRASP_HEIGHT[0])
+        & (height < GRASP_HEIGHT[1])
         & (model.bunch_radius <= MAX_BUNCH_RADIUS)
         & (axis[:, 2] < -0.95)
     )
@@ -230,7 +232,7 @@ def _base_poses(model: Model, near: np.ndarray, min_clearance: float) -> Iterato
         ):
             for k in np.flatnonzero(roomy[i, j]).tolist() if clear >= min_clearance else ():
                 score = clear - 0.01 * float(np.linalg.norm(base[i, j, k] - near))
-                pose = frames.pose(np.append(base[i, j, k], 0.0), turn[j])
+                pose = on_ground(model.terrain, frames.pose(np.append(base[i, j, k], 0.0), turn[j]))
                 found.append((-score, bunch, ("left", "right")[k], pose, clear))
     for _, bunch, side, pose, clear in sorted(found, key=lambda entry: entry[:3]):
         yield bunch, side, pose, clear
@@ -423,7 +425,8 @@ def plan_meeting(model: Model, near: np.ndarray, box: int = 0) -> MeetPlan:
         raise PlacementError(f"no way for a carrier to box {box}: it needs {TURNING_RADIUS} m around it; move the box")
     to_box = min(ways, key=lambda points: float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum()))
     centres = bunch_centres(model)
-    fits = (centres[:, 2] > BUNCH_HEIGHT[0]) & (centres[:, 2] < BUNCH_HEIGHT[1]) & (model.bunch_pull < MAX_PULL)
+    height = above_ground(model.terrain, centres)
+    fits = (height > BUNCH_HEIGHT[0]) & (height < BUNCH_HEIGHT[1]) & (model.bunch_pull < MAX_PULL)
     order = np.argsort(np.linalg.norm(centres[:, :2] - to_box[-1], axis=1), kind="stable")
     for bunch in order[fits[order]].tolist():
         for stand in _standing_places(model, centres[bunch, :2]):

@@ -6,8 +6,10 @@ import msgspec
 import numpy as np
 
 from vinesim.core import frames
+from vinesim.scene.generation.uneven_ground import build_terrain
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene, Spawn
+from vinesim.scene.terrain import above_ground, on_ground
 
 PUSH_REACH = (0.35, 0.85)
 """[m] Horizontal distances from the base at which an arm can push a bunch."""
@@ -37,14 +39,16 @@ def spawn_pose(scene: Scene, number: int, back: float = 0.0) -> np.ndarray:
 
     Raises :class:`PlacementError` if the scene has no start place of that ``number``.
     """
+    terrain = build_terrain(scene)
     if not scene.spawns:
-        return frames.pose([-2.0 - back, 1.5 * number, 0.0])
+        return on_ground(terrain, frames.pose([-2.0 - back, 1.5 * number, 0.0]))
     if number >= len(scene.spawns):
         known = ", ".join(f"{i} {spawn.name}" for i, spawn in enumerate(scene.spawns))
         raise PlacementError(f"scene {scene.name!r} has no start place {number}; it has: {known}")
     spawn = scene.spawns[number]
     ahead = np.array([np.cos(spawn.yaw), np.sin(spawn.yaw), 0.0])
-    return frames.pose(np.array([spawn.x, spawn.y, 0.0]) - back * ahead, frames.from_yaw(spawn.yaw))
+    level = frames.pose(np.array([spawn.x, spawn.y, 0.0]) - back * ahead, frames.from_yaw(spawn.yaw))
+    return on_ground(terrain, level)
 
 
 def start_pose(scene: Scene, number: int, back: float = 0.0, queue: int = 0) -> np.ndarray:
@@ -106,7 +110,8 @@ def ground_clearance(model: Model, points: np.ndarray, *, without: int = -1) -> 
 
     ``without``: number of a box that is ignored.
     """
-    solid = np.minimum(model.fixed_start[:, 2], model.fixed_end[:, 2]) < OVERHEAD
+    ends = (above_ground(model.terrain, end) for end in (model.fixed_start, model.fixed_end))
+    solid = np.minimum(*ends) < OVERHEAD
     clearance = np.full(len(points), np.inf)
     if solid.any():
         start = model.fixed_start[solid, :2]
@@ -131,7 +136,8 @@ def find_push_pose(model: Model, near: np.ndarray) -> tuple[int, np.ndarray]:
     Raises :class:`PlacementError` if there is no such bunch.
     """
     centres = bunch_centres(model)
-    high = np.flatnonzero((centres[:, 2] > PUSH_HEIGHT[0]) & (centres[:, 2] < PUSH_HEIGHT[1]))
+    height = above_ground(model.terrain, centres)
+    high = np.flatnonzero((height > PUSH_HEIGHT[0]) & (height < PUSH_HEIGHT[1]))
     high = high[np.argsort(np.linalg.norm(centres[high, :2] - near, axis=1), kind="stable")][:MAX_CANDIDATES]
     centres = centres[high]
     heading = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
@@ -146,7 +152,8 @@ def find_push_pose(model: Model, near: np.ndarray) -> tuple[int, np.ndarray]:
         )
     distance = np.where(fits, np.linalg.norm(places - near, axis=-1), np.inf)
     bunch, turn = np.unravel_index(int(np.argmin(distance)), distance.shape)
-    return int(high[bunch]), frames.pose(np.append(places[bunch, turn], 0.0), frames.from_yaw(heading[turn]))
+    stand = frames.pose(np.append(places[bunch, turn], 0.0), frames.from_yaw(heading[turn]))
+    return int(high[bunch]), on_ground(model.terrain, stand)
 
 
 def find_approach_pose(model: Model, place: np.ndarray, length: float) -> np.ndarray:
@@ -164,6 +171,6 @@ def find_approach_pose(model: Model, place: np.ndarray, length: float) -> np.nda
                 float(ground_clearance(model, line).min()), float(np.linalg.norm(line - place[:2], axis=1).min()) - 0.6
             )
             if clearance > most:
-                best = frames.pose(np.append(goal, 0.0), frames.from_yaw(angle))
+                best = on_ground(model.terrain, frames.pose(np.append(goal, 0.0), frames.from_yaw(angle)))
                 most = clearance
     return best

@@ -12,6 +12,7 @@ wp.set_module_options({"enable_backward": False})
 
 # MuJoCo's mjtGeom
 PLANE = wp.constant(0)
+HEIGHT_FIELD = wp.constant(1)
 SPHERE = wp.constant(2)
 CAPSULE = wp.constant(3)
 ELLIPSOID = wp.constant(4)

@@ -21,14 +21,15 @@ from vinesim.kernels.contact.body_motion import (
 from vinesim.kernels.contact.broadphase import aabbs_disjoint, is_collidable, list_near_geoms
 from vinesim.kernels.contact.candidates import Candidate, curvature_gap, is_smooth, store_candidate
 from vinesim.kernels.contact.distance import (
+    HEIGHT_FIELD,
     MESH,
-    PLANE,
     has_flat_or_straight_side,
     interval_along_face,
     is_outside_box,
     segment_primitive_distance,
     vec5d,
 )
+from vinesim.kernels.contact.ground_distance import segment_ground_distance
 from vinesim.kernels.contact.hull_distance import interval_along_hull, segment_hull_distance
 from vinesim.kernels.contact.structs import (
     AWAKE_TREES,
@@ -94,9 +95,22 @@ def segment_geom_distance(
         found[0] = normal[0]
         found[1] = normal[1]
         found[2] = normal[2]
+    elif not is_round and geoms.kind[g] == HEIGHT_FIELD:
+        found = segment_ground_distance(hulls, a, b)
     else:
         found = segment_primitive_distance(is_round, geoms.kind[g], geoms.size[g], rotation, center, a, b)
     return found
+
+
+@wp.func
+def is_in_tile(is_round: bool, geoms: Geoms, g: int, center: wp.vec3d, p: wp.vec3d):
+    """Returns whether point ``p`` [m] is above or below the geom, if the geom is a tile of uneven ground; True for other
+    geoms. So a capsule across the border of two tiles touches one of them."""
+    inside = bool(True)
+    if not is_round and geoms.kind[g] == HEIGHT_FIELD:
+        half = geoms.half[g]
+        inside = wp.abs(p[0] - center[0]) <= half[0] and wp.abs(p[1] - center[1]) <= half[1]
+    return inside
 
 
 @wp.func
@@ -204,20 +218,24 @@ def rigid_candidate(
     relative = velocity - geom_velocity
     approach = dt * wp.dot(candidate.normal, relative)
     if is_static:
-        at_rest = segment_primitive_distance(
-            is_round,
-            geoms.kind[g],
-            geoms.size[g],
-            pair.rotation,
-            geom_states.center[g] - geom_states.offset[g],
-            to_double(capsules.rest_start[s]),
-            to_double(capsules.rest_end[s]),
-        )
+        rest_a = to_double(capsules.rest_start[s])
+        rest_b = to_double(capsules.rest_end[s])
+        at_rest = vec5d()
+        if not is_round and geoms.kind[g] == HEIGHT_FIELD:
+            at_rest = segment_ground_distance(hulls, rest_a, rest_b)
+        else:
+            at_rest = segment_primitive_distance(
+                is_round,
+                geoms.kind[g],
+                geoms.size[g],
+                pair.rotation,
+                geom_states.center[g] - geom_states.offset[g],
+                rest_a,
+                rest_b,
+            )
         overlap = -wp.min(at_rest[3] - radius - parameters.margin, zero)
         if overlap > zero and was_cut_off(body, bodies.parent, bodies.is_cut):
-            moved = wp.max(
-                wp.length(a - to_double(capsules.rest_start[s])), wp.length(b - to_double(capsules.rest_end[s]))
-            )
+            moved = wp.max(wp.length(a - rest_a), wp.length(b - rest_b))
             overlap = wp.max(radius - at_rest[3] - moved, zero)
         candidate.gap = candidate.gap + overlap
         free = velocity_at(bodies.q[body], bodies.qd_free[body], candidate.point)
@@ -345,12 +363,16 @@ def add_pairs(
         limit = bound + geoms.radius[g] + margin
         rotation = rigid.xmat[geoms.id[g]]
         near = wp.dot(between, between) < limit * limit
-        if near and not is_round and geoms.kind[g] != PLANE:
+        if near and not is_round and geoms.kind[g] > HEIGHT_FIELD:
             to_local = wp.transpose(rotation)  # the box test is fast, and excludes half of all pairs
             near = not is_outside_box(geoms.half[g], to_local * (a - center), to_local * (b - center), radius + margin)
         if near:
             nearest = segment_geom_distance(is_round, geoms, hulls, g, rotation, center, a, b, radius + margin)
-            if nearest[3] - radius < margin and not is_tied(s, geoms.id[g], capsules, bodies.is_cut):
+            if (
+                nearest[3] - radius < margin
+                and is_in_tile(is_round, geoms, g, center, a + nearest[4] * (b - a))
+                and not is_tied(s, geoms.id[g], capsules, bodies.is_cut)
+            ):
                 ends = contact_ends(is_round, parameters, geoms, hulls, g, rotation, center, a, b, nearest)
                 pair = Pair()
                 pair.capsule = s

@@ -231,7 +231,8 @@ class PassingBunches:
 
 @wp.struct
 class Hulls:
-    """Convex hulls of meshes, in the frame of the geoms with that mesh, relative to the centre of their box."""
+    """Shapes that a geom's size does not determine: convex hulls of meshes, in the frame of the geoms with that mesh,
+    relative to the centre of their box; and uneven ground."""
 
     first_plane: wp.array(dtype=wp.int32)
     """[hull + 1] Index of the hull's first plane."""
@@ -247,6 +248,11 @@ class Hulls:
     """[edge] Index of the plane on one side of the edge."""
     edge_right: wp.array(dtype=wp.int32)
     """[edge] Index of the plane on the other side of the edge."""
+    ground: wp.array2d(dtype=wp.float32)
+    """[row, column] m, height of the nodes of uneven ground above its inclined plane; empty if the ground is a plane."""
+    ground_frame: wp.array(dtype=wp.float64)
+    """[5] Position x and y [m] of the first node of uneven ground, distance between nodes [m], and rise [1] of its
+    inclined plane along x and y."""
 
 
 @wp.struct

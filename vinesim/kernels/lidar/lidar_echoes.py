@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from vinesim.kernels.raster.ground import Ground, ground_gradient, is_uneven
 from vinesim.kernels.raster.primitives import Shapes, normal_at
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -80,6 +81,7 @@ def sorted_rays(
     distance: wp.array(dtype=wp.float32),
     primitive: wp.array(dtype=wp.int32),
     ground_organ: int,
+    ground: Ground,
 ) -> SortedRays:
     """Returns the hits of the rays of laser shot ``shot``, sorted by range (insertion sort).
 
@@ -98,6 +100,10 @@ def sorted_rays(
         if it != -1 and r >= receiver.nearest and r <= receiver.farthest:
             n = wp.vec3(0.0, 0.0, 1.0)
             matter = ground_organ
+            if it < 0 and is_uneven(ground):
+                p = wp.transform_point(pose, direction[ray] * r)
+                rise = ground_gradient(ground, p[0], p[1])
+                n = wp.normalize(wp.vec3(-rise[0], -rise[1], 1.0))
             if it >= 0:
                 n = normal_at(shapes, it, wp.transform_point(pose, direction[ray] * r))
                 matter = organ[it]
@@ -185,6 +191,7 @@ def detect_returns(
     label: wp.array(dtype=wp.int32),
     organ: wp.array(dtype=wp.int32),
     receiver: Receiver,
+    ground: Ground,
     # in
     first: int,
     pose: wp.transform,
@@ -207,7 +214,7 @@ def detect_returns(
     """
     shot = first + wp.tid()
     rays = receiver.rays
-    met = sorted_rays(shapes, organ, receiver, shot, pose, direction, distance, primitive, ground_organ)
+    met = sorted_rays(shapes, organ, receiver, shot, pose, direction, distance, primitive, ground_organ, ground)
     echoes = find_echoes(receiver, met, noise[shot, 2])
     strongest = echoes.strongest
     last = echoes.last

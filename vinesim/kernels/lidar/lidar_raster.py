@@ -6,6 +6,7 @@ along a cone or cylinder; boxes, cylinders and leaves also by the corners of a b
 
 import warp as wp
 
+from vinesim.kernels.raster.ground import Ground, ground_hit, is_uneven
 from vinesim.kernels.raster.pinhole import (
     BATCH,
     EMPTY_KEY,
@@ -510,6 +511,8 @@ def raster_clusters(  # noqa: PLR0915 - one loop over all kinds of primitives ke
 
 @wp.kernel
 def resolve_keys(
+    # model
+    ground: Ground,
     # in
     keys: wp.array(dtype=wp.int64),
     head: LidarHead,
@@ -528,11 +531,18 @@ def resolve_keys(
     for at in range(first, first + run):
         t = head.max_range
         i = wp.int32(-1)
+        key = keys[at]
         fall = wp.dot(up, ray_direction(head, at))
-        if fall < -1.0e-6 and head.eye[2] > 0.0 and -head.eye[2] / fall < t:
+        if is_uneven(ground):
+            if key < EMPTY_KEY:
+                t = wp.min(t, float(key >> wp.int64(32)) * 1.0e-6)
+            met = ground_hit(ground, head.eye, wp.transpose(head.rotation) * ray_direction(head, at), t)
+            t = wp.min(met, head.max_range)
+            if met < FAR:
+                i = -2
+        elif fall < -1.0e-6 and head.eye[2] > 0.0 and -head.eye[2] / fall < t:
             t = -head.eye[2] / fall
             i = -2
-        key = keys[at]
         if key < EMPTY_KEY:
             z = float(key >> wp.int64(32)) * 1.0e-6
             if z < t:

@@ -6,6 +6,7 @@ pixel's ray in closed form and keeps the nearest hit (:mod:`vinesim.kernels.rast
 
 import warp as wp
 
+from vinesim.kernels.raster.ground import Ground, ground_hit, is_uneven
 from vinesim.kernels.raster.pinhole import (
     EMPTY_KEY,
     NEAR_DEPTH,
@@ -221,12 +222,20 @@ def ground_depth(lens: Pinhole, x: int, y: int) -> float:
     return wp.where(meets and t < lens.max_depth, t, FAR)
 
 
+@wp.func
+def uneven_ground_depth(ground: Ground, lens: Pinhole, x: int, y: int, nearest: float) -> float:
+    """Returns the depth [m] at which the ray of pixel (x, y) meets uneven ground, or FAR if it does not before
+    ``nearest`` [m]."""
+    d = wp.transpose(lens.rotation) * pixel_ray(lens, x, y)
+    return ground_hit(ground, lens.eye, d, wp.min(lens.max_depth, nearest))
+
+
 @wp.kernel
 def resolve_keys(
     # model
     label: wp.array(dtype=wp.int32),
+    ground: Ground,
     # in
-    keys: wp.array(dtype=wp.int64),
     lens: Pinhole,
     ground_label: int,
     nearest: float,
@@ -235,6 +244,7 @@ def resolve_keys(
     too_far: float,
     run: int,
     # out
+    keys_out: wp.array(dtype=wp.int64),
     primitive_out: wp.array(dtype=wp.int32),
     depth_out: wp.array(dtype=wp.float32),
     labels_out: wp.array(dtype=wp.int32),
@@ -243,14 +253,22 @@ def resolve_keys(
 
     Threads begin at row ``lens.first_row``. label: [primitive]; keys: [pixel] see
     :mod:`vinesim.kernels.raster.pinhole`; too_near, too_far: depth reported below ``nearest`` [m] and above
-    ``farthest`` [m]; primitive: [pixel] -1 the sky, -2 the ground; depth: [pixel] m; labels: [pixel].
+    ``farthest`` [m]; primitive: [pixel] -1 the sky, -2 the ground; depth: [pixel] m; labels: [pixel]. On uneven ground
+    the keys get its depth.
     """
     first = lens.first_row * lens.width + wp.tid() * run
     column = first % lens.width
     row = first // lens.width
     for pixel in range(first, first + run):
-        key = keys[pixel]
-        t = ground_depth(lens, column + pixel - first, row)
+        key = keys_out[pixel]
+        t = float(FAR)
+        if is_uneven(ground):
+            behind = wp.where(key < EMPTY_KEY, float(key >> wp.int64(32)) * 1.0e-6, FAR)
+            t = uneven_ground_depth(ground, lens, column + pixel - first, row, behind)
+            if t < FAR:  # shading reads it there
+                keys_out[pixel] = wp.int64(t * 1.0e6) << wp.int64(32)
+        else:
+            t = ground_depth(lens, column + pixel - first, row)
         i = wp.where(t < FAR, -2, -1)
         name = wp.where(t < FAR, ground_label, 0)
         if key < EMPTY_KEY:

@@ -6,6 +6,7 @@ never degrades their hierarchy, and a robot that drives through the rows does no
 
 import warp as wp
 
+from vinesim.kernels.raster.ground import Ground, ground_hit, is_uneven
 from vinesim.kernels.raster.pinhole import SMOOTH_SIZE, Pinhole, pixel_ray
 from vinesim.kernels.raster.primitives import FAR, LEAF, Shapes, hit_primitive, xyz
 
@@ -14,12 +15,14 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class Hierarchies:
-    """Ids of two Warp BVHs: of plants (primitives 0 to ``first_rigid`` - 1) and of rigid links (all later primitives)."""
+    """Ids of two Warp BVHs: of plants (primitives 0 to ``first_rigid`` - 1) and of rigid links (all later primitives);
+    and the ground."""
 
     plants: wp.uint64
     rigid: wp.uint64
     first_rigid: int
     """Index of the first primitive of a link. Negative if there are no links."""
+    ground: Ground
 
 
 @wp.struct
@@ -53,7 +56,12 @@ def first_hit(h: Hierarchies, s: Shapes, o: wp.vec3, d: wp.vec3, reach: float, f
     best = Hit()
     best.t = reach
     best.primitive = -1
-    if d[2] < -1.0e-6 and o[2] > 0.0:
+    if is_uneven(h.ground):
+        t = ground_hit(h.ground, o, d, best.t)
+        if t < best.t:
+            best.t = t
+            best.primitive = -2
+    elif d[2] < -1.0e-6 and o[2] > 0.0:
         t = -o[2] / d[2]
         if t < best.t:
             best.t = t

@@ -8,6 +8,7 @@ bloom, transmit light when they are pale, and are darker where they touch other 
 
 import warp as wp
 
+from vinesim.kernels.raster.ground import ground_gradient, is_uneven
 from vinesim.kernels.raster.pinhole import Pinhole
 from vinesim.kernels.raster.primitives import LEAF, SPHEROID, Shapes
 from vinesim.kernels.shading.materials import (
@@ -222,7 +223,8 @@ def seen_surface(
 ) -> Surface:
     """Returns the material properties of primitive ``i`` (-2: the ground) at ``p`` [m], seen along the unit ray ``d``.
 
-    ``footprint`` and ``slant`` are the lengths that one pixel covers across and along the line of sight [m].
+    ``footprint`` and ``slant`` are the lengths that one pixel covers across and along the line of sight [m]; ``slant``
+    is used on level ground only.
     """
     s = Surface()
     if i >= 0:
@@ -234,7 +236,12 @@ def seen_surface(
         else:
             s = solid_surface(shapes, materials, i, p, footprint)
     else:
-        s = ground_surface(materials, p, footprint, slant)
+        along = slant
+        if is_uneven(materials.ground):
+            rise = ground_gradient(materials.ground, p[0], p[1])
+            incidence = (d[2] - rise[0] * d[0] - rise[1] * d[1]) / wp.sqrt(1.0 + wp.dot(rise, rise))
+            along = footprint / wp.max(-incidence, 1.0e-3)
+        s = ground_surface(materials, p, footprint, along)
     return s
 
 
@@ -323,6 +330,7 @@ def shade_pixels(
                 u = float(0.0)
                 v = float(0.0)
                 depth = float(0.0)
+                nearness = float(0.0)
                 share = float(0.0)
                 for k in range(c, corners):
                     x = left + (k & half)
@@ -333,11 +341,14 @@ def shade_pixels(
                             u += float(x)
                             v += float(y)
                             depth += float(keys[pixel] >> wp.int64(32))
+                            nearness += 1.0e6 / wp.max(float(keys[pixel] >> wp.int64(32)), 1.0)
                             share += 1.0
                 per = 1.0 / share
                 ray = back * wp.vec3((u * per - lens.cx) / lens.fx, (v * per - lens.cy) / lens.fy, 1.0)
                 z = depth * per * 1.0e-6
-                if i == -2:
+                if i == -2 and is_uneven(materials.ground):
+                    z = share / nearness  # on a plane 1 / z is linear in the picture
+                elif i == -2:
                     z = -lens.eye[2] / ray[2]
                 colour = wp.vec3(0.0, 0.0, 0.0)
                 if i == -1:

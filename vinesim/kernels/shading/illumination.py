@@ -6,6 +6,7 @@ unit is the light on a level white panel in the open.
 
 import warp as wp
 
+from vinesim.kernels.raster.ground import is_uneven
 from vinesim.kernels.raster.pinhole import Pinhole
 from vinesim.kernels.raster.primitives import LEAF, Shapes
 from vinesim.kernels.shading.deferred import Light, ambient_light, seen_surface, shadow_turn, sun_share
@@ -64,7 +65,7 @@ def illuminate_pixels(
             left = pixel - top * lens.width
             ray = back * wp.vec3((float(left) - lens.cx) / lens.fx, (float(top) - lens.cy) / lens.fy, 1.0)
             z = float(keys[pixel] >> wp.int64(32)) * 1.0e-6
-            if i == -2:
+            if i == -2 and not is_uneven(materials.ground):
                 z = -lens.eye[2] / ray[2]
             scale = wp.length(ray)
             d = ray / scale

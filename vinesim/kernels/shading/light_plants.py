@@ -3,6 +3,7 @@
 
 import warp as wp
 
+from vinesim.kernels.raster.ground import ground_relief
 from vinesim.kernels.raster.pinhole import Pinhole
 from vinesim.kernels.raster.primitives import scale_along
 from vinesim.kernels.shading.deferred import Light, ambient_light
@@ -221,9 +222,52 @@ def ground_light(
     ray = point_ray(lens, back, points.u[slot], points.v[slot])
     z = -lens.eye[2] / ray[2]
     scale = wp.length(ray)
-    p = lens.eye + ray * z
     pixel = z * 2.0 / lens.fx
     slant = pixel * z * scale / lens.eye[2]
+    level = wp.vec2(0.0, 0.0)
+    return soil_light(tables, materials, light, maps, lens.eye + ray * z, level, pixel, slant, z * scale)
+
+
+@wp.func
+def uneven_ground_light(
+    tables: FloatTables,
+    materials: Materials,
+    light: Light,
+    maps: ShadowMaps,
+    lens: Pinhole,
+    back: wp.mat33,
+    points: Points,
+    slot: int,
+) -> wp.vec3:
+    """Returns the radiance (linear RGB) of point ``slot`` of :class:`Points`, which is on uneven ground; see
+    :func:`ground_light`."""
+    ray = point_ray(lens, back, points.u[slot], points.v[slot])
+    z = points.z[slot]
+    scale = wp.length(ray)
+    p = lens.eye + ray * z
+    pixel = z * 2.0 / lens.fx
+    rise = ground_relief(materials.ground, p[0], p[1])
+    incidence = (ray[2] - rise[0] * ray[0] - rise[1] * ray[1]) / (scale * wp.sqrt(1.0 + wp.dot(rise, rise)))
+    return soil_light(tables, materials, light, maps, p, rise, pixel, pixel / wp.max(-incidence, 1.0e-3), z * scale)
+
+
+@wp.func
+def soil_light(
+    tables: FloatTables,
+    materials: Materials,
+    light: Light,
+    maps: ShadowMaps,
+    p: wp.vec3,
+    rise: wp.vec2,
+    pixel: float,
+    slant: float,
+    distance: float,
+) -> wp.vec3:
+    """Returns the radiance (linear RGB) of the ground at ``p`` [m], where it rises by ``rise`` [1] along x and y.
+
+    ``pixel`` and ``slant`` are the lengths that one pixel covers across and along the line of sight [m]; ``distance``:
+    from the camera [m].
+    """
     blur = 1.0 / (1.0 + slant * slant * 1.5)
     t = texels_around(p[0] * 0.21, p[1] * 0.21)
     coarse = 0.5 + (sampled(tables.noise, t, 0) - 0.5) * blur
@@ -234,7 +278,7 @@ def ground_light(
     t = texels_around(p[0] * 0.8, p[1] * 0.8)
     tone = 0.5 + (sampled(tables.soil, t, 0) - 0.5) * detail
     sod = 0.5 + (sampled(tables.soil, t, 1) - 0.5) * detail
-    n = unit(wp.vec3(sampled(tables.soil, t, 2) * detail, sampled(tables.soil, t, 3) * detail, 1.0))
+    n = unit(wp.vec3(sampled(tables.soil, t, 2) * detail - rise[0], sampled(tables.soil, t, 3) * detail - rise[1], 1.0))
     # the share of visible sky, and whether the point is inside the vineyard (0 to 1)
     x = (p[0] - materials.ground_x) / materials.ground_cell
     y = (p[1] - materials.ground_y) / materials.ground_cell
@@ -270,7 +314,7 @@ def ground_light(
     lit = sun_share(maps, p, n * wp.where(ndl < 0.0, -1.0, 1.0), sky)
     direct = light.sun_colour * (wp.max(ndl, 0.0) * lit * (0.35 + 0.65 * occlusion))
     colour = wp.cw_mul(albedo, direct + ambient_light(light, n, sky) * occlusion)
-    return haze(light, colour, z * scale)
+    return haze(light, colour, distance)
 
 
 @wp.func
@@ -359,5 +403,6 @@ def berry_light(
 
 
 light_ground = point_kernel(__name__, "light_ground", GROUND, ground_light)
+light_uneven_ground = point_kernel(__name__, "light_uneven_ground", GROUND, uneven_ground_light)
 light_blades = point_kernel(__name__, "light_blades", BLADES, blade_light)
 light_berries = point_kernel(__name__, "light_berries", BERRIES, berry_light)

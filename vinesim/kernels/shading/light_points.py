@@ -133,6 +133,7 @@ def sort_points(
                 u = float(0.0)
                 v = float(0.0)
                 depth = float(0.0)
+                nearness = float(0.0)
                 share = float(0.0)
                 mask = wp.int32(0)
                 i = wp.int32(-3)
@@ -146,6 +147,7 @@ def sort_points(
                             u += float(k & 1)
                             v += float(k >> 1)
                             depth += float(keys[at] >> wp.int64(32))
+                            nearness += 1.0 / wp.max(float(keys[at] >> wp.int64(32)), 1.0)
                             share += 1.0
                 done = done | mask
                 kind = point_class(shapes, materials, i)
@@ -154,6 +156,8 @@ def sort_points(
                 u_out[slot] = float(left) + u / share
                 v_out[slot] = float(top) + v / share
                 z_out[slot] = depth / share * 1.0e-6
+                if i == -2:  # on a plane 1 / z is linear in the picture
+                    z_out[slot] = share / nearness * 1.0e-6
                 primitive_out[slot] = i
                 pixels_out[slot] = (pixel << 4) | mask
     for k in range(CLASS_COUNT):

@@ -3,6 +3,7 @@ leaves."""
 
 import warp as wp
 
+from vinesim.kernels.raster.ground import Ground, ground_relief, is_uneven
 from vinesim.kernels.raster.primitives import Shapes, scale_along, xyz
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -44,6 +45,8 @@ class Materials:
     ground_x: float
     ground_y: float
     ground_cell: float
+    """The share of visible sky [row, column] above the ground, position of its first entry and its spacing [m]."""
+    ground: Ground
 
 
 @wp.func
@@ -139,6 +142,9 @@ def ground_surface(materials: Materials, p: wp.vec3, pixel: float, slant: float)
         tone = 0.5 + (t[0] - 0.5) * detail
         sod = 0.5 + (t[1] - 0.5) * detail
         n = wp.normalize(wp.vec3(t[2] * detail, t[3] * detail, 1.0))
+    if is_uneven(materials.ground):
+        rise = ground_relief(materials.ground, p[0], p[1])
+        n = wp.normalize(wp.vec3(n[0] / n[2] - rise[0], n[1] / n[2] - rise[1], 1.0))
     s = diffuse_surface(n, wp.vec3(0.0, 0.0, 0.0), 0.75)
     inside = float(0.0)
     x = (p[0] - materials.ground_x) / materials.ground_cell

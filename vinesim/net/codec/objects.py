@@ -23,7 +23,18 @@ OBJECTS = 5
 """Number of the kind of message with states of boxes and bunches, the fourth byte of the message."""
 
 POSITION_LSB = 1e-4
-"""Quantisation step of a position in its cell [m]. Positions are clipped at 3.2 m from the cell's origin."""
+"""Quantisation step of a position in its cell [m]. Positions are clipped at 3.2 m from the origin of their level in the
+cell."""
+
+LEVEL_HEIGHT = 4.0
+"""[m] Distance between the levels in which heights on a slope are counted. On level ground every object is in level 0.
+"""
+
+_LEVEL_BIT = 4
+"""Factor of the level in an object's flags, above the bits of the other flags."""
+
+_HIGHEST_LEVEL = 31
+"""Largest level; the lowest one is -32."""
 
 CELL_ORIGIN_OFFSET = np.array([0.5 * CELL_SIZE, 0.5 * CELL_SIZE, 2.5])
 """Vector [3] m from the lower corner of a cell on the ground to the origin of the quantised positions in the cell."""
@@ -93,7 +104,10 @@ def encode_objects(objects: ObjectStates, cell: Cell) -> tuple[list[bytes], Obje
     records = np.empty(len(ids), _OBJECT)
     for name in ("object", "ownership", "authority", "flags"):
         records[name] = getattr(objects, name)
-    records["position"] = np.clip(np.rint((objects.pose[:, :3] - _cell_origin(cell)) / POSITION_LSB), -32767, 32767)
+    level = _levels(objects.pose[:, 2])
+    records["flags"] += (level % (256 // _LEVEL_BIT) * _LEVEL_BIT).astype(np.uint8)
+    origin = _cell_origin(cell) + level[:, None] * [0.0, 0.0, LEVEL_HEIGHT]
+    records["position"] = np.clip(np.rint((objects.pose[:, :3] - origin) / POSITION_LSB), -32767, 32767)
     records["turn"] = pack_quaternions(objects.pose[:, 3:])
     velocity = objects.velocity.reshape(-1, 2, 3)
     fastest = np.maximum(np.abs(velocity).max(2) / (127.0 * MIN_VELOCITY_LSB), 1.0)
@@ -119,7 +133,7 @@ def decode_objects(payload: bytes, cell: Cell) -> ObjectStates:
     ids = records["object"].astype(np.int64)
     if (ids[1:] <= ids[:-1]).any() or ids[0] < OBJECT_STRIDE or ids[-1] >= len(ObjectKind) * OBJECT_STRIDE:
         raise MessageError("objects that are trees, of no kind, or in an order that does not increase")
-    if (records["flags"] > TOUCHED).any():
+    if (records["flags"] % _LEVEL_BIT > TOUCHED).any():
         raise MessageError("objects with unknown flags")
     if (np.maximum(records["scale"] % 16, records["scale"] // 16) > MAX_EXPONENT).any():
         raise MessageError("objects that are faster than anything in a vineyard")
@@ -129,13 +143,15 @@ def decode_objects(payload: bytes, cell: Cell) -> ObjectStates:
 def _read_objects(time: float, records: np.ndarray, cell: Cell) -> ObjectStates:
     """Decode the valid records of a message about objects in ``cell``."""
     pose = np.empty((len(records), 7))
-    pose[:, :3] = records["position"] * POSITION_LSB + _cell_origin(cell)
+    level = records["flags"].view(np.int8) // _LEVEL_BIT
+    pose[:, :3] = records["position"] * POSITION_LSB + _cell_origin(cell) + level[:, None] * [0.0, 0.0, LEVEL_HEIGHT]
     pose[:, 3:] = unpack_quaternions(records["turn"])
     exponent = np.stack([records["scale"] % 16, records["scale"] // 16], -1).astype(float)
     unit = np.repeat(MIN_VELOCITY_LSB * 2.0**exponent, 3, axis=1)
     velocity = np.concatenate([records["velocity"], records["spin"]], -1) * unit
     ids = records["object"].astype(np.int64)
-    return ObjectStates(time, ids, records["ownership"], records["authority"], records["flags"], pose, velocity)
+    flags = records["flags"] % _LEVEL_BIT
+    return ObjectStates(time, ids, records["ownership"], records["authority"], flags, pose, velocity)
 
 
 OBJECTS_FIELDS = {
@@ -168,6 +184,14 @@ def describe_objects(payload: bytes, key: str) -> dict[str, Any]:
 def _cell_origin(cell: Cell) -> np.ndarray:
     """Returns the origin of the quantised positions in a cell: a position [3] m in the world."""
     return np.array([cell[0] * CELL_SIZE, cell[1] * CELL_SIZE, 0.0]) + CELL_ORIGIN_OFFSET
+
+
+def _levels(height: np.ndarray) -> np.ndarray:
+    """Returns the level [k] of objects at ``height`` [k] m: 0 for all that a position in level 0 can express."""
+    above = height - CELL_ORIGIN_OFFSET[2]
+    level = np.rint(above / LEVEL_HEIGHT)
+    level = np.clip(level, -1 - _HIGHEST_LEVEL, _HIGHEST_LEVEL)
+    return np.where(np.abs(above) <= 32767 * POSITION_LSB, 0.0, level).astype(int)
 
 
 def check_object_id(object_id: int, counts: tuple[int, ...] | None = None) -> None:

@@ -12,7 +12,7 @@ from vinesim.core import frames
 from vinesim.robot.description.grippers import AnyGripper, Cutter
 from vinesim.robot.description.kinematics import MovingJoints
 from vinesim.robot.description.sidecar import BaseLimits, JointGroup
-from vinesim.scene.values import ControllerSpec, Drive, RenderedMount, RobotSpec, SensorMount, SensorPacing
+from vinesim.scene.values import ControllerSpec, Drive, ImuMount, RenderedMount, RobotSpec, SensorMount, SensorPacing
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -23,7 +23,7 @@ class RobotDescription:
     """The robot's name in the URDF."""
     file: pathlib.Path
     urdf: str
-    """Text of the URDF for physics and ``/robot_description``, with absolute paths of meshes."""
+    """Text of the URDF for physics and other clients: repaired, with absolute paths of meshes."""
     base: str
     """Name of the root link: base_footprint, if the URDF has this link."""
     drives: tuple[Drive, ...]
@@ -41,7 +41,7 @@ class RobotDescription:
     frame of that link."""
     sensors: tuple[RenderedMount, ...]
     """Cameras, lidars and other rendered sensors, in the order of :data:`vinesim.scene.values.SENSOR_KINDS`."""
-    imus: tuple[SensorMount, ...]
+    imus: tuple[ImuMount, ...]
     wrenches: tuple[SensorMount, ...]
     sensor_pacing: SensorPacing
     grippers: tuple[AnyGripper, ...]
@@ -54,6 +54,11 @@ class RobotDescription:
     """Changes and derived values that were made during loading, one line each."""
     meshes: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     """Corners [face, 3, 3] m of meshes that were received over the network, by the file name in ``urdf``."""
+    ros_urdf: str = ""
+    """Text of the URDF for ``/robot_description``: the user's own, with the addresses of meshes at which other programs
+    find them."""
+    original_names: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """Names of links and joints in the robot file, by the valid names that replace them."""
     is_remote: bool = False
     """Whether the description was received over the network, because another client simulates the robot."""
 

@@ -1,4 +1,4 @@
-"""Meshes of a URDF: finds their files, sets their absolute paths, and replaces meshes whose format physics cannot read.
+"""Meshes of a URDF: finds their files, and sets the paths, shapes and colours with which physics and sensors read them.
 
 Each mesh gets three attributes: ``bounds``, its bounding box, and ``digest`` and ``faces``, with which other clients
 request its triangles (:mod:`vinesim.scene.triangles`). A client that receives the URDF over the network opens no file
@@ -7,23 +7,20 @@ that the URDF names. It replaces a mesh by the box of its ``bounds`` if it has n
 
 from __future__ import annotations
 
+import copy
 import functools
-import importlib.util
 import pathlib
-import sys
 from collections.abc import Mapping
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
+from vinesim.robot.description.packages import find_resource
 from vinesim.robot.description.urdf import description_error, parse_origin
 from vinesim.scene import triangles
+from vinesim.scene.appearance.mesh_files import EmptyMeshError, MeshPart, mesh_parts, read_triangles
 
-MESH_FORMATS = (".stl", ".obj", ".msh")
-"""File formats of meshes that MuJoCo reads. Meshes in other formats, such as Collada, are replaced."""
-MAX_STL_FACES = 200_000
-"""Largest number of faces in an STL file that MuJoCo reads."""
 MIN_BOX_EDGE = 1e-4
 """[m] Smallest edge of a box that replaces a mesh, since a mesh may be flat."""
 
@@ -45,67 +42,79 @@ class MeshOffer(NamedTuple):
     """Size of the mesh's encoded triangles [B]."""
 
 
-def find_mesh(uri: str, file: pathlib.Path) -> pathlib.Path | None:
-    """Returns the file of a mesh URI: relative to the folder of the URDF, in a package folder above it, or installed
-    with a wheel. Returns None if it is missing."""
-    path = uri.removeprefix("file://")
-    if not path.startswith("package://"):
-        found = file.parent / path
-        return found.resolve() if found.is_file() else None
-    path = path.removeprefix("package://")
-    inside = path.split("/", 1)[-1]
-    for above in file.parents:
-        for candidate in (above / path, above / inside):
-            if candidate.is_file():
-                return candidate.resolve()
-    return find_installed(path)
+def resolve_meshes(root: etree._Element, file: pathlib.Path, assumed: list[str]) -> dict[str, pathlib.Path]:
+    """Set the absolute paths of all meshes of a robot ``file``, as physics reads them. Returns the file of each mesh by
+    the name that ``root`` had for it.
 
-
-def resolve_meshes(root: etree._Element, file: pathlib.Path, notes: list[str]) -> None:
-    """Set the absolute paths of all meshes, and replace meshes whose format cannot be read.
-
-    A collision mesh is replaced by its bounding box, a visual mesh by the collision shapes of its link. Replacements
-    are added to ``notes``. Raises :class:`DescriptionError` for a missing or broken file.
+    A mesh whose format physics cannot read is converted. A visible mesh with colours of its own becomes one shape for
+    each colour, as RViz shows it: its colours come before the ``<material>`` of the shape. Adds
+    meshes without triangles, which are left out, to ``assumed``. Raises :class:`DescriptionError` for a missing or
+    broken file.
     """
+    sources: dict[str, pathlib.Path] = {}
+    empty: list[str] = []
     for mesh in root.iterfind("link//geometry/mesh"):
         uri = mesh.get("filename", "")
-        found = find_mesh(uri, file)
+        found = sources.get(uri) or find_resource(uri, file)
         if found is None:
-            raise description_error(
-                file, f"mesh {uri!r} is missing", "put it into the folder of the URDF, or install its package"
-            )
-        mesh.set("filename", str(found))
-    unread: set[str] = set()
-
-    def readable(shape: etree._Element) -> bool:
-        """Returns whether MuJoCo can read the mesh of a shape."""
+            raise description_error(file, f"mesh {uri!r} is missing", _remedy(uri))
+        sources[uri] = found
+    for shape in [*root.iterfind("link/visual"), *root.iterfind("link/collision")]:
         mesh = shape.find("geometry/mesh")
-        suffix = pathlib.Path(mesh.get("filename")).suffix.lower() if mesh is not None else ".stl"
-        readable = suffix in MESH_FORMATS and (mesh is None or suffix != ".stl" or _is_binary_stl(mesh.get("filename")))
-        if not readable:
-            unread.add(suffix if suffix not in MESH_FORMATS else f"{suffix} (text, or too large)")
-        return readable
-
-    for link in root.iterfind("link"):
-        for shape in [shape for shape in link.iterfind("collision") if not readable(shape)]:
-            mesh = shape.find("geometry/mesh")
-            _replace_by_box(shape, mesh, _facts(mesh, file).bounds)
-        for shape in [shape for shape in link.iterfind("visual") if not readable(shape)]:
-            material = shape.find("material")
-            for solid in link.findall("collision"):
-                visual = etree.SubElement(link, "visual")
-                visual.extend(etree.fromstring(etree.tostring(part)) for part in solid)
-                if material is not None:
-                    visual.append(etree.fromstring(etree.tostring(material)))
-            link.remove(shape)
-    if unread:
-        formats = ", ".join(sorted(unread))
-        notes.append(f"meshes of format {formats} cannot be read: shown as collision shapes, boxes in contacts")
+        if mesh is None:
+            continue
+        source = sources[mesh.get("filename", "")]
+        try:
+            parts = mesh_parts(source, colored=shape.tag == "visual")
+        except EmptyMeshError:
+            empty.append(source.name)
+            shape.getparent().remove(shape)
+            continue
+        except Exception as error:  # each format raises different errors
+            raise description_error(
+                file, f"mesh {str(source)!r} cannot be read ({error})", "convert it to STL or OBJ"
+            ) from error
+        link = shape.getparent()
+        for part in parts[1:]:
+            copied = copy.deepcopy(shape)
+            link.insert(link.index(shape) + 1, copied)
+            _use_part(copied, part)
+        _use_part(shape, parts[0])
+    if empty:
+        assumed.append(f"mesh {empty[0]!r} has no triangles: left out")
     for mesh in root.iterfind("link//geometry/mesh"):
         facts = _facts(mesh, file)
         mesh.set("bounds", " ".join(f"{value:.6g}" for value in facts.bounds.ravel()))
         mesh.set("digest", facts.digest)
         mesh.set("faces", str(facts.faces))
+    return sources
+
+
+def _remedy(uri: str) -> str:
+    """Returns what a user can do about a mesh ``uri`` that was not found."""
+    scheme, separator, rest = uri.partition("://")
+    if separator and scheme in ("package", "model"):
+        where = "AMENT_PREFIX_PATH or ROS_PACKAGE_PATH" if scheme == "package" else "GZ_SIM_RESOURCE_PATH"
+        return (
+            f"source the workspace with {rest.split('/')[0]!r} (it is in no folder of {where}), or put the folder "
+            f"{rest.split('/')[0]!r} beside or above the file"
+        )
+    if separator and scheme.startswith("http"):
+        return "check the address and the connection"
+    return "put it into the folder of the robot file"
+
+
+def _use_part(shape: etree._Element, part: MeshPart) -> None:
+    """Set the mesh file and the colour of a shape."""
+    shape.find("geometry/mesh").set("filename", str(part.file))
+    if part.color is None:
+        return
+    material = shape.find("material")
+    if material is None:
+        material = etree.SubElement(shape, "material", name="")
+    for old in material.findall("color"):
+        material.remove(old)
+    etree.SubElement(material, "color", rgba=" ".join(f"{value:.6g}" for value in part.color))
 
 
 def list_meshes(urdf: str) -> dict[str, MeshOffer]:
@@ -131,19 +140,6 @@ def list_meshes(urdf: str) -> dict[str, MeshOffer]:
             allowed[digest] = mesh
             room -= mesh.size
     return allowed
-
-
-def read_triangles(file: str) -> np.ndarray:
-    """Returns the corners [face, 3, 3] m, float32, of a mesh file. Raises the errors of the file's format if it is
-    unreadable."""
-    if file.lower().endswith(".stl") and _is_binary_stl(file):
-        facet = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-        with open(file, "rb") as opened:
-            faces = int.from_bytes(opened.read(84)[80:84], "little")
-            return np.fromfile(opened, facet, faces)["corners"]
-    import trimesh
-
-    return np.asarray(cast("trimesh.Trimesh", trimesh.load(file, force="mesh")).triangles, np.float32)
 
 
 def replace_unopened_meshes(
@@ -177,15 +173,6 @@ def replace_unopened_meshes(
     if count:
         assumed.append(f"{count} meshes of another client are not opened: replaced by boxes of the same size")
     return meshes
-
-
-def _is_binary_stl(filename: str) -> bool:
-    """Returns whether MuJoCo can read an STL file: its size is that of a binary STL, and it has at most
-    :data:`MAX_STL_FACES` faces."""
-    with open(filename, "rb") as file:
-        header = file.read(84)
-    faces = int.from_bytes(header[80:84], "little")
-    return 1 <= faces <= MAX_STL_FACES and pathlib.Path(filename).stat().st_size >= 84 + 50 * faces
 
 
 class _Facts(NamedTuple):
@@ -237,14 +224,3 @@ def _replace_by_box(shape: etree._Element, mesh: etree._Element, bounds: np.ndar
     geometry.remove(mesh)
     size = np.maximum(np.abs(upper - lower), MIN_BOX_EDGE)
     etree.SubElement(geometry, "box", size=" ".join(f"{value:.9g}" for value in size))
-
-
-def find_installed(path: str) -> pathlib.Path | None:
-    """Returns the path of a file that a cmeel wheel (such as example-robot-data) installed in ``share``; None if it
-    is missing."""
-    roots = [pathlib.Path(sys.prefix) / "share"]
-    cmeel = importlib.util.find_spec("cmeel")
-    if cmeel is not None and cmeel.origin:
-        roots.append(pathlib.Path(cmeel.origin).parent.parent / "cmeel.prefix" / "share")
-    roots += [pathlib.Path(entry) / "cmeel.prefix" / "share" for entry in sys.path if entry]
-    return next((root / path for root in roots if (root / path).is_file()), None)

@@ -13,7 +13,7 @@ import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
 from vinesim.robot.description.kinematics import link_anchors
-from vinesim.robot.description.urdf import MOVABLE_JOINT_TYPES, Joint, Robot, parse_inertial
+from vinesim.robot.description.urdf import MOVABLE_JOINT_TYPES, Joint, Robot, fix_joint, parse_inertial
 
 MOUNT = "world_mount"
 """New name of a root link ``world``. A robot whose root link has this name is bolted down."""
@@ -35,6 +35,42 @@ LEAST_MOMENT = 1e-12
 """[kg m2] Magnitude up to which a principal moment counts as 0."""
 LEAST_MOMENT_SHARE = 1e-3
 """Share of the largest principal moment to which principal moments with a rounding error are raised."""
+
+
+def drive_the_base(root: etree._Element, notes: list[str], assumed: list[str]) -> None:
+    """Remove the floating or planar joint at the root of a robot, and the link above it (``world``): the base is
+    driven. Floating and planar joints elsewhere become fixed. Adds this to ``notes`` or ``assumed``."""
+    children = {joint.find("child").get("link") for joint in root.iterfind("joint") if joint.find("child") is not None}
+    fixed = []
+    for joint in root.findall("joint"):
+        if joint.get("type") not in ("floating", "planar"):
+            continue
+        parent = joint.find("parent")
+        above = parent.get("link") if parent is not None else None
+        links = [link for link in root.iterfind("link") if link.get("name") == above]
+        beside = [other for other in root.iterfind("joint/parent") if other.get("link") == above]
+        is_bare = bool(links) and not any(links[0].find(tag) is not None for tag in ("visual", "collision", "inertial"))
+        if above not in children and len(beside) == 1 and (is_bare or above == "world"):
+            root.remove(joint)
+            root.remove(links[0])
+            notes.append(f"its base moves on a {joint.get('type')} joint: it is driven in the plane")
+        else:
+            fix_joint(joint)
+            fixed.append(joint.get("name", ""))
+    if fixed:
+        assumed.append(f"{some_names(fixed)} is floating or planar, but not at the root: fixed")
+
+
+def lift_to_ground(root: etree._Element, base: str, height: float, notes: list[str]) -> None:
+    """Add a root link on the ground, ``height`` [m] below the root link ``base``. Adds this to ``notes``."""
+    links = {link.get("name") for link in root.iterfind("link")}
+    name = next(one for one in ("base_footprint", "footprint", "ground_footprint") if one not in links)
+    etree.SubElement(root, "link", name=name)
+    joint = etree.SubElement(root, "joint", name=f"{name}_joint", type="fixed")
+    etree.SubElement(joint, "origin", xyz=f"0 0 {height:.6g}", rpy="0 0 0")
+    etree.SubElement(joint, "parent", link=name)
+    etree.SubElement(joint, "child", link=base)
+    notes.append(f"it stands on the ground, {height:.3g} m below {base!r}, by a new root link {name!r}")
 
 
 def rename_world(root: etree._Element, notes: list[str]) -> None:
@@ -113,9 +149,18 @@ def _compose_mimics(joints: Mapping[str, etree._Element]) -> None:
 
 
 def repair_inertias(root: etree._Element, assumed: list[str]) -> None:
-    """Increase principal moments of inertia that are 0, or negative by a rounding error, to a small positive value."""
+    """Increase principal moments of inertia that are 0, or negative by a rounding error, to a small positive value. Add
+    an inertia where there is only a mass."""
     repaired = []
+    lacking = []
     for link in root.iterfind("link"):
+        given = link.find("inertial")
+        if given is not None and given.find("mass") is None:
+            link.remove(given)
+        elif given is not None and given.find("inertia") is None:
+            mass = float(given.find("mass").get("value", 0.0))
+            _set_inertial(link, mass, np.identity(3) * max(mass, 0.0) * GYRATION_RADIUS**2)
+            lacking.append(link.get("name"))
         inertial = parse_inertial(link.find("inertial"))
         if inertial is None or inertial.inertia is None or not inertial.inertia.any():
             continue
@@ -125,6 +170,8 @@ def repair_inertias(root: etree._Element, assumed: list[str]) -> None:
         raised = np.maximum(moments, LEAST_MOMENT_SHARE * moments[2]) if moments[2] > LEAST_MOMENT else np.zeros(3)
         _set_inertial(link, inertial.mass or 0.0, axes * raised @ axes.T)
         repaired.append(link.get("name"))
+    if lacking:
+        assumed.append(f"{some_names(lacking)} has no inertia: radius of gyration {1e3 * GYRATION_RADIUS:g} mm")
     if repaired:
         assumed.append(f"inertia of {some_names(repaired)} is not positive definite: its smallest moments are raised")
 
@@ -138,18 +185,21 @@ def add_missing_masses(root: etree._Element, robot: Robot, base: str, order: lis
     anchors = link_anchors(base, order)
     mass = dict.fromkeys((base, *(joint.child for joint in order if joint.type != "fixed")), 0.0)
     inertia = dict(mass)
+    heaviest: dict[str, tuple[float, str]] = {}
     for link in robot.links:
         if link.inertial is not None:
             anchor = anchors[link.name][0]
             mass[anchor] += link.inertial.mass or 0.0
+            heaviest[anchor] = max(heaviest.get(anchor, (0.0, link.name)), (link.inertial.mass or 0.0, link.name))
             inertia[anchor] += 0.0 if link.inertial.inertia is None else float(np.abs(link.inertial.inertia).max())
     lacking = [link for link in mass if mass[link] == 0.0 or inertia[link] == 0.0]
     elements = {link.get("name"): link for link in root.iterfind("link")}
     for link in lacking:
         own = mass[link] or DEFAULT_MASS
-        existing = parse_inertial(elements[link].find("inertial"))
-        kept = existing.mass if existing is not None and existing.mass else (0.0 if mass[link] else DEFAULT_MASS)
-        _set_inertial(elements[link], kept, np.identity(3) * own * GYRATION_RADIUS**2)
+        holder = heaviest[link][1] if mass[link] else link
+        existing = parse_inertial(elements[holder].find("inertial"))
+        kept = existing.mass if existing is not None and existing.mass else DEFAULT_MASS
+        _set_inertial(elements[holder], kept, np.identity(3) * own * GYRATION_RADIUS**2)
     if lacking:
         assumed.append(
             f"{some_names(lacking)} moves without mass or inertia: {1e3 * DEFAULT_MASS:g} g, "

@@ -16,7 +16,7 @@ import numpy as np
 
 from vinesim.robot.description.grippers import AnyGripper, Cutter
 from vinesim.robot.description.urdf import description_error
-from vinesim.scene.values import SENSOR_KINDS, RenderedMount, SensorMode, SensorMount, SensorPacing
+from vinesim.scene.values import SENSOR_KINDS, ImuMount, RenderedMount, SensorMode, SensorMount, SensorPacing
 
 
 class BaseLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -103,7 +103,8 @@ class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     base: BaseLimits = BaseLimits()
     groups: dict[str, JointGroup] = {}
     sensors: SensorTable = SensorTable()
-    imus: tuple[SensorMount, ...] = ()
+    imus: tuple[ImuMount, ...] | None = None
+    """None: the IMUs are those of the robot file, or guessed from its links."""
     wrenches: tuple[SensorMount, ...] = ()
     grippers: tuple[AnyGripper, ...] | None = None
     """Grippers of the robot. None: fingers are guessed by :func:`vinesim.robot.description.grippers.guess_fingers`."""
@@ -206,7 +207,7 @@ def check_sidecar(
         gripper.check(sidecar.groups, links, file)
     if not all(0.0 <= slip < 1.0 for slip in sidecar.base.slip):
         raise description_error(file, f"slip of {sidecar.base.slip}", "give shares from 0 to below 1")
-    mounts: Iterable[SensorMount] = (*sensors, *sidecar.imus, *sidecar.wrenches)
+    mounts: Iterable[SensorMount] = (*sensors, *(sidecar.imus or ()), *sidecar.wrenches)
     for mount in mounts:
         if mount.frame not in links:
             raise description_error(file, f"{mount.name!r} is mounted on {mount.frame!r}", "name a link of the URDF")

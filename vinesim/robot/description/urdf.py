@@ -66,22 +66,67 @@ def description_error(file: pathlib.Path, problem: str, remedy: str) -> Descript
 # ------------------------------------------------------------------ the file as XML
 
 
-def read_xml(file: pathlib.Path) -> etree._Element:
-    """Returns the root element of a URDF. Raises :class:`DescriptionError` if the file is not XML or its root is not
-    ``<robot>``."""
-    try:
-        root = etree.fromstring(file.read_bytes(), etree.XMLParser(remove_comments=True, resolve_entities=False))
-    except etree.XMLSyntaxError as error:
-        raise description_error(
-            file, f"not well-formed XML: {error.msg}", "correct this line (is it a xacro? expand it)"
-        ) from error
-    if root.getroottree().docinfo.internalDTD is not None:
-        raise description_error(file, "it declares a document type (DTD)", "remove <!DOCTYPE ...>: a URDF needs none")
-    if root.tag != "robot":
-        raise description_error(
-            file, f"its root is <{root.tag}>, not <robot>", "give a URDF (MJCF and SDF are not read)"
-        )
+def read_xml(file: pathlib.Path, tag: str = "robot") -> etree._Element:
+    """Returns the root element of a URDF or SRDF. Raises :class:`DescriptionError` if the file is not XML or its root
+    is not ``tag``."""
+    root = parse_xml(file.read_bytes(), file)
+    if root.tag != tag:
+        raise description_error(file, f"its root is <{root.tag}>, not <{tag}>", f"give a file that begins with <{tag}>")
     return root
+
+
+def parse_xml(content: bytes, file: pathlib.Path) -> etree._Element:
+    """Returns the root element of the ``content`` of an XML file, without comments and without XML namespaces, except
+    that of xacro. Raises :class:`DescriptionError` if it is not XML, or declares a document type.
+
+    A text in another encoding than its declaration says is read as Windows-1252, a superset of Latin-1. Prefixes of
+    namespaces need not be declared.
+    """
+    content = content.strip() if b"\0" not in content[:64] else content  # not of UTF-16
+    try:
+        root = _parse(content)
+    except etree.XMLSyntaxError as error:
+        says = str(error).lower()
+        try:
+            if error.code == etree.ErrorTypes.ERR_UNKNOWN_VERSION:
+                root = _parse(re.sub(rb"<\?xml[^>]*\?>", b"", content, count=1))
+            elif "encoding" in says or "utf-8" in says:
+                root = _parse(content, encoding="cp1252")
+            elif error.code == etree.ErrorTypes.NS_ERR_UNDEFINED_NAMESPACE:
+                root = _parse(content, recover=True)
+            else:
+                raise error
+        except etree.XMLSyntaxError as worse:
+            raise description_error(file, f"not well-formed XML: {worse.msg}", "correct this line") from worse
+    if root.getroottree().docinfo.internalDTD is not None:
+        raise description_error(file, "it declares a document type (DTD)", "remove <!DOCTYPE ...>: it is not needed")
+    for element in root.iter(etree.Element):
+        if _has_unknown_prefix(element.tag):
+            element.tag = element.tag.replace(":", "_")
+        for key in filter(_has_unknown_prefix, list(element.attrib)):
+            element.set(key.replace(":", "_"), element.attrib.pop(key))
+        name = etree.QName(element)
+        if name.namespace and not is_of_xacro(name.namespace):
+            element.tag = name.localname
+    etree.cleanup_namespaces(root)
+    return root
+
+
+def is_of_xacro(namespace: str) -> bool:
+    """Returns whether an XML namespace is that of xacro, such as ``http://www.ros.org/wiki/xacro``."""
+    return namespace.rstrip("/").endswith("xacro")
+
+
+def _has_unknown_prefix(name: str) -> bool:
+    """Returns whether the name of an element or attribute has a prefix of a namespace that is not declared."""
+    return ":" in name and not name.startswith("{")
+
+
+def _parse(content: bytes, *, encoding: str | None = None, recover: bool = False) -> etree._Element:
+    parser = etree.XMLParser(
+        remove_comments=True, remove_pis=True, resolve_entities=False, encoding=encoding, recover=recover
+    )
+    return etree.fromstring(content, parser)
 
 
 def check_friction(root: etree._Element, file: pathlib.Path) -> None:
@@ -114,24 +159,6 @@ def set_friction(root: etree._Element, friction: Mapping[str, float], file: path
         etree.SubElement(gazebo, "mu1").text = repr(float(coefficient))
 
 
-def merge_disabled_collisions(root: etree._Element, file: pathlib.Path, notes: list[str]) -> None:
-    """Copy the ``disable_collisions`` of an SRDF ``file`` into the URDF, for links that exist in the URDF. Adds this to
-    ``notes``.
-
-    Physics, ROS and other clients read the pairs from the URDF. Raises :class:`DescriptionError` if the file is missing
-    or no SRDF.
-    """
-    if not file.is_file():
-        raise description_error(file, "this SRDF is missing", "correct its path in the robot's TOML file")
-    pairs = read_xml(file).findall("disable_collisions")
-    links = {link.get("name") for link in root.iterfind("link")}
-    known = [pair for pair in pairs if links.issuperset((pair.get("link1"), pair.get("link2")))]
-    for pair in known:
-        etree.SubElement(root, "disable_collisions", link1=pair.get("link1"), link2=pair.get("link2"))
-    unknown = f", {len(pairs) - len(known)} more name links that it lacks" if len(known) < len(pairs) else ""
-    notes.append(f"{len(known)} pairs of links never touch by {file.name}{unknown}")
-
-
 def check_numbers(root: etree._Element, file: pathlib.Path) -> None:
     """Raise :class:`DescriptionError` unless all numbers are complete and within bounds, and all sizes are above 0."""
     for element in root.iter(*{tag for tag, _ in NUMBER_COUNTS}):
@@ -144,9 +171,7 @@ def check_numbers(root: etree._Element, file: pathlib.Path) -> None:
             try:
                 numbers = [float(word) for word in text.split()]
             except ValueError as error:
-                raise description_error(
-                    file, f"{where} is no number", "write decimal numbers (is it a xacro? expand it)"
-                ) from error
+                raise description_error(file, f"{where} is no number", "write decimal numbers") from error
             if len(numbers) != count:
                 raise description_error(file, f"{where} has {len(numbers)} of {count} numbers", "give all of them")
             if not all(map(math.isfinite, numbers)):
@@ -166,12 +191,17 @@ def fix_wheels(root: etree._Element, notes: list[str]) -> None:
         if joint.get("type") in MOVABLE_JOINT_TYPES and re.search(r"wheel|caster", joint.get("name", ""))
     ]
     for joint in wheels:
-        joint.set("type", "fixed")
-        for tag in ("axis", "limit", "mimic", "dynamics", "safety_controller"):
-            for element in joint.findall(tag):
-                joint.remove(element)
+        fix_joint(joint)
     if wheels:
         notes.append(f"{len(wheels)} wheel and caster joints are fixed: the base is driven as a whole")
+
+
+def fix_joint(joint: etree._Element) -> None:
+    """Make a joint fixed."""
+    joint.set("type", "fixed")
+    for tag in ("axis", "limit", "mimic", "dynamics", "safety_controller"):
+        for element in joint.findall(tag):
+            joint.remove(element)
 
 
 # ------------------------------------------------------------------ links and joints

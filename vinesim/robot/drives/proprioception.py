@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from vinesim.core import frames
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
-from vinesim.scene.values import Contact, ElasticSample, Imu, JointSample, SensorMount, Wrench
+from vinesim.scene.values import Contact, ElasticSample, Imu, ImuMount, JointSample, SensorMount, Wrench
 
 
 class BodySensors:
@@ -44,10 +45,14 @@ class BodySensors:
             wrench[3:] += frames.rotate(back, frames.cross(arm, force).sum(0))
         return Wrench(time, mount.name, mount.frame, wrench[:3], wrench[3:])
 
-    def _imu(self, mount: SensorMount, time: float) -> Imu:
+    def _imu(self, mount: ImuMount, time: float) -> Imu:
         orientation = self._rigid.link_pose(self._name, mount.frame)[3:]
         angular_velocity = self._rigid.link_angular_velocity(self._name, mount.frame)
         acceleration = self._rigid.link_acceleration(self._name, mount.frame)[3:]
+        if mount.angular_velocity_noise or mount.acceleration_noise:
+            rng = np.random.default_rng([zlib.crc32(mount.name.encode()), round(time / self._rigid.dt)])
+            angular_velocity = angular_velocity + mount.angular_velocity_noise * rng.standard_normal(3)
+            acceleration = acceleration + mount.acceleration_noise * rng.standard_normal(3)
         return Imu(time, mount.name, mount.frame, orientation, angular_velocity, acceleration)
 
 

@@ -49,13 +49,15 @@ class RobotInstance:
         self.lights = Lights()
         """State of the indicator lights."""
         self._shown_color: Color | None = None
-        back = frames.conjugate(spec.pose[3:])
-        self._start = spec.pose[:3].copy()
+        # on uneven ground the base stands lower or higher than given, and tilted
+        start = spec.pose if rigid.model.terrain is None else rigid.base_state(self.name)[0]
+        back = frames.conjugate(start[3:])
+        self._start = start[:3].copy()
         self._start_turn = frames.to_matrix(back)
         self._start_left = frames.multiply(back, np.eye(4)).T
         """[4, 4] Matrix that multiplies a quaternion from the left by the inverse of the orientation at the start."""
         self._tracks_slip = any(description.base_limits.slip)
-        self._track_odometry = TrackOdometry(*description.base_limits.slip, spec.pose)
+        self._track_odometry = TrackOdometry(*description.base_limits.slip, start)
 
     @property
     def shown_lights(self) -> Color | None:
@@ -144,7 +146,10 @@ class RemoteRobot(RobotInstance):
 
     def _teleport(self, update: RobotUpdate, here: np.ndarray) -> None:
         """Place the copy at the state of ``update``. ``here`` [7]: present pose of its base."""
-        if abs(update.base_q[2] - here[2]) > 1e-3:  # the base joint is planar, so another height needs a new body
+        is_level = self.rigid.model.terrain is None
+        if (
+            is_level and abs(update.base_q[2] - here[2]) > 1e-3
+        ):  # the base joint is planar, so another height needs a new body
             self.rigid.remove_robot(self.name)
             self._shown_color = None
             self.rigid.add_robot(self.description.to_spec(self.name, self._index, update.base_q))

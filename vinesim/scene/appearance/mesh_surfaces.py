@@ -23,7 +23,7 @@ def smooth_surface(vertices: np.ndarray, faces: np.ndarray, scale: tuple[float, 
 
     Vertices that are close to each other are merged until the mesh has at most :data:`MAX_SURFACE_FACES` faces.
     """
-    return _with_normals(*_simplify(vertices, faces, scale))
+    return _with_normals(*simplify(vertices, faces, scale))
 
 
 def received_surface(corners: np.ndarray, scale: tuple[float, ...]) -> Mesh:
@@ -36,7 +36,7 @@ def received_surface(corners: np.ndarray, scale: tuple[float, ...]) -> Mesh:
 
     every = np.arange(3 * len(corners)).reshape(-1, 3)
     merged = trimesh.Trimesh(corners.reshape(-1, 3).astype(float), every, process=True)
-    vertices, faces = _simplify(np.asarray(merged.vertices), np.asarray(merged.faces), scale)
+    vertices, faces = simplify(np.asarray(merged.vertices), np.asarray(merged.faces), scale)
     _, count = np.unique(np.round(vertices[faces.ravel()], 6), axis=0, return_counts=True)
     if not 1 <= len(faces) <= 4 * MAX_SURFACE_FACES or (count.astype(float) ** 2).sum() > _MAX_NEIGHBOURS:
         raise TrianglesError(f"{len(corners)} triangles that coincide or have no area")
@@ -51,7 +51,9 @@ def read_surface(file: str, scale: tuple[float, ...]) -> Mesh:
     return smooth_surface(np.asarray(mesh.vertices), np.asarray(mesh.faces), scale)
 
 
-def _simplify(vertices: np.ndarray, faces: np.ndarray, scale: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+def simplify(vertices: np.ndarray, faces: np.ndarray, scale: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the vertices [vertex, 3] m and faces [face, 3] of a scaled mesh with at most :data:`MAX_SURFACE_FACES`
+    faces, as far as merging near vertices can reduce them."""
     vertices = vertices * scale
     if np.prod(scale) < 0.0:
         faces = faces[:, ::-1]

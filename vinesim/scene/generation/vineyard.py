@@ -20,6 +20,13 @@ from vinesim.scene.generation.plant_bodies import Bodies, build_bodies, place_le
 from vinesim.scene.generation.shoot_slots import CORE_SLOTS, MAX_BUNCHES, cluster_slots, peduncle_slots
 from vinesim.scene.generation.shoots import Shoots, sample_shoots
 from vinesim.scene.generation.ties import find_ties
+from vinesim.scene.generation.uneven_ground import (
+    TrellisRise,
+    build_terrain,
+    raise_shoots,
+    raise_structure,
+    raise_ties,
+)
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
@@ -28,6 +35,7 @@ from vinesim.scene.plant_import.ties import tie_to_wires
 from vinesim.scene.plant_import.wood import build_model, join_models
 from vinesim.scene.plant_parameters import VineParameters
 from vinesim.scene.spec import Datum, Scene, Sun, Wind
+from vinesim.scene.terrain import Terrain, ground_height
 
 
 def generate(scene: Scene) -> Model:
@@ -38,9 +46,10 @@ def generate(scene: Scene) -> Model:
     Raises :class:`~vinesim.core.toml_loader.DataError` if the scene's plant parameters cannot be read.
     """
     parameters = plant_parameters.load_plant(scene.plants)
+    terrain = build_terrain(scene)
 
     def make() -> disk_cache.Arrays:
-        model = _generate(scene, parameters)
+        model = _generate(scene, parameters, terrain)
         return {name: getattr(model, name) for name in Model.array_fields()}
 
     # settings that no plant depends on must not change the digest
@@ -55,14 +64,19 @@ def generate(scene: Scene) -> Model:
         plants="",
         imported=(),
     )
+    if terrain is not None:  # the path of an image must not change the digest, but its content must
+        plants = msgspec.structs.replace(plants, terrain=None)
+    ground = (
+        None if terrain is None else (repr(terrain.origin), terrain.cell, terrain.slope, terrain.residual.tobytes())
+    )
     imported = [(load_imported_plant(one.file), msgspec.structs.replace(one, file="")) for one in scene.imported]
-    digest = disk_cache.source_digest(_code_digest(), msgspec.json.encode((plants, parameters, imported)))
-    return Model(**disk_cache.load_or_make("vineyard", digest, make)).check()
+    digest = disk_cache.source_digest(_code_digest(), msgspec.json.encode((plants, parameters, imported, ground)))
+    return Model(terrain=terrain, **disk_cache.load_or_make("vineyard", digest, make)).check()
 
 
 def generate_uncached(scene: Scene) -> Model:
     """Returns the same model as :func:`generate` without using the cache. For scenes that are needed only once."""
-    return _generate(scene, plant_parameters.load_plant(scene.plants))
+    return _generate(scene, plant_parameters.load_plant(scene.plants), build_terrain(scene))
 
 
 @functools.cache
@@ -73,17 +87,30 @@ def _code_digest() -> str:
     return disk_cache.source_digest(package, *others, repr(berries.VARIETIES))
 
 
-def _generate(scene: Scene, parameters: VineParameters) -> Model:
+def _generate(scene: Scene, parameters: VineParameters, terrain: Terrain | None) -> Model:
     structure = build_fixed_structure(scene, parameters)
     shoots = sample_shoots(scene, parameters, structure)
     bodies = build_bodies(parameters, shoots)
-    leaf = place_leaves(scene, parameters, shoots, bodies)
     ties = find_ties(scene, parameters, structure, shoots, bodies)
+    if terrain is not None:
+        rise = TrellisRise(terrain, scene.layout)
+        structure = raise_structure(structure, terrain, rise)
+        shoots = raise_shoots(shoots, rise)
+        level = bodies
+        bodies = build_bodies(parameters, shoots)
+        ties = raise_ties(ties, shoots, level, bodies)
+    leaf = place_leaves(scene, parameters, shoots, bodies)
     model = _assemble_model(scene, parameters, structure, shoots, bodies, leaf, ties)
+    if terrain is not None:
+        model.terrain = terrain
+        for i, box in enumerate(scene.boxes):
+            half = 0.5 * box.size[0], 0.5 * box.size[1]
+            model.box_pose[i] = terrain.resting_pose(box.x, box.y, box.yaw, half)
     model = builder.solve_rest_pose(model).check()
     variety = [v.name for v in berries.VARIETIES].index(scene.fruit.varieties[0])
     for number, one in enumerate(scene.imported):
-        pose = frames.pose(np.array([one.x, one.y, one.z]), frames.from_yaw(one.yaw))
+        foot = one.z + float(ground_height(terrain, one.x, one.y))
+        pose = frames.pose(np.array([one.x, one.y, foot]), frames.from_yaw(one.yaw))
         # spawn keys of length 3, because those of vines have length 2
         rng = np.random.default_rng(np.random.SeedSequence(scene.seed, spawn_key=(0, 0, number)))
         plant = build_model(

@@ -30,6 +30,15 @@ class SensorMount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     type: str = ""
 
 
+class ImuMount(SensorMount, frozen=True, forbid_unknown_fields=True):
+    """An inertial measurement unit on a robot."""
+
+    angular_velocity_noise: float = 0.0
+    """Standard deviation of each measured angular velocity [rad/s]."""
+    acceleration_noise: float = 0.0
+    """Standard deviation of each measured acceleration [m/s2]."""
+
+
 class RenderedMount(SensorMount, frozen=True, forbid_unknown_fields=True):
     """A sensor on a robot whose measurements are rendered, such as a camera or a lidar: one of :data:`SENSOR_KINDS`."""
 
@@ -443,12 +452,54 @@ class CameraMount(PictureMount, frozen=True, forbid_unknown_fields=True):
 
     kind: ClassVar[str] = "camera"
     quality: Literal["fast", "full", "still"] = "fast"
+    field_of_view: float | None = None
+    """Horizontal angle of view [rad]; by default that of the sensor's data file."""
+    range: tuple[float, float] | None = None
+    """Smallest and largest depth that is measured [m]; by default those of the sensor's data file."""
+    noise: float = 0.0
+    """Standard deviation of each colour value [1], as a share of the largest value."""
+
+    def fault(self) -> tuple[str, str] | None:
+        """Returns the name of an invalid field and how to correct it; None if all values are valid."""
+        if self.field_of_view is not None and not 0.01 <= self.field_of_view <= 3.1:
+            return f"the field_of_view {self.field_of_view}", "give 0.01 to 3.1 rad"
+        if self.range is not None and not 0.0 <= self.range[0] < self.range[1] <= 1000.0:
+            return f"the range {list(self.range)}", "give 0 <= nearest < farthest <= 1000 m"
+        if not 0.0 <= self.noise <= 1.0:
+            return f"the noise {self.noise}", "give 0 to 1"
+        return super().fault()
 
 
 class LidarMount(RenderedMount, frozen=True, forbid_unknown_fields=True):
     """A spinning lidar on a robot."""
 
     kind: ClassVar[str] = "lidar"
+    columns: int | None = None
+    """Number of shots of one laser in a full turn; by default that of the sensor's data file."""
+    elevations: tuple[float, ...] | None = None
+    """Elevation of each laser [rad]; by default those of the sensor's data file."""
+    sector: tuple[float, float] | None = None
+    """First and last azimuth that is measured, counter-clockwise from ahead [rad]; by default a full turn."""
+    range: tuple[float, float] | None = None
+    """Smallest and largest range that is measured [m]; by default those of the sensor's data file."""
+    noise: float | None = None
+    """Standard deviation of every range [m]. If it is given, beams have no width, and every echo is detected."""
+
+    def fault(self) -> tuple[str, str] | None:
+        """Returns the name of an invalid field and how to correct it; None if all values are valid."""
+        if self.columns is not None and not 2 <= self.columns <= 10_000:
+            return f"the columns {self.columns}", "give 2 to 10000"
+        if self.elevations is not None and not (
+            1 <= len(self.elevations) <= 256 and all(abs(angle) <= 1.58 for angle in self.elevations)
+        ):
+            return f"{len(self.elevations)} elevations", "give 1 to 256 from -1.57 to 1.57 rad"
+        if self.sector is not None and not -6.3 <= self.sector[0] < self.sector[1] <= 6.3:
+            return f"the sector {list(self.sector)}", "give first < last, -6.28 to 6.28 rad"
+        if self.range is not None and not 0.0 <= self.range[0] < self.range[1] <= 500.0:
+            return f"the range {list(self.range)}", "give 0 <= nearest < farthest <= 500 m"
+        if self.noise is not None and not 0.0 <= self.noise <= 1.0:
+            return f"the noise {self.noise}", "give 0 to 1 m"
+        return super().fault()
 
 
 class MultispectralMount(PictureMount, frozen=True, forbid_unknown_fields=True):

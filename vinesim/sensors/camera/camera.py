@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from typing import Annotated
 
 import msgspec
@@ -69,6 +70,20 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
             lens_map(spec.info(""))
         except LensError as error:
             raise spec_file.SensorError(f"camera {name!r}: {error}") from error
+        return spec
+
+    def mounted(self, mount: CameraMount) -> CameraSpec:
+        """Returns the data sheet with the values that a robot's ``mount`` gives instead."""
+        number = msgspec.structs.replace
+        spec = self
+        if mount.field_of_view is not None:
+            focal = 0.5 * self.width.value / math.tan(0.5 * mount.field_of_view)
+            spec = msgspec.structs.replace(spec, fx=number(self.fx, value=focal), fy=number(self.fy, value=focal))
+        if mount.range is not None:
+            near, far = (
+                number(one, value=value) for one, value in zip((self.nearest, self.farthest), mount.range, strict=True)
+            )
+            spec = msgspec.structs.replace(spec, nearest=near, farthest=far)
         return spec
 
     def ideal(self) -> CameraSpec:
@@ -169,6 +184,8 @@ class Camera:
     seed: int = 0
     image_index: int = 0
     """Index of the next image. The seed, the camera's name and this index determine the noise of the measured depth."""
+    noise: float = 0.0
+    """Standard deviation of each colour value [1], as a share of the largest value."""
 
     def __post_init__(self) -> None:
         if self.quality not in QUALITIES:
@@ -261,6 +278,10 @@ class Camera:
             too_near = exact < self.spec.nearest.value
             too_far = exact > self.spec.farthest.value
             depth = np.where(too_near, np.float32(-np.inf), np.where(too_far, np.float32(np.inf), exact))
+        if self.noise and CameraOutput.RGB in outputs:
+            rng = spec_file.noise_rng(self.seed + 1, self.name, self.image_index)  # another one than that of the depth
+            grain = 255.0 * self.noise * rng.standard_normal(rgb.shape, np.float32)
+            rgb = np.clip(np.round(rgb + grain), 0.0, 255.0).astype(np.uint8)
         self.image_index += 1
         return CameraFrame(
             time=float(time),
@@ -369,7 +390,7 @@ class Camera:
 
 
 def _make(mount: CameraMount, setting: SensorSetting) -> Camera:
-    spec = CameraSpec.load(mount.type)
+    spec = CameraSpec.load(mount.type).mounted(mount)
     return Camera(
         spec,
         spec.info(mount.frame, size=mount.size),
@@ -380,6 +401,7 @@ def _make(mount: CameraMount, setting: SensorSetting) -> Camera:
         threads=setting.threads,
         seed=setting.seed,
         image_index=setting.number,
+        noise=mount.noise,
     )
 
 

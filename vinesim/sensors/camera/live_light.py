@@ -77,8 +77,9 @@ class LiveLight:
         seen = [self._seen.primitive, self._seen.keys, _ROWS, first, points]
         launch(light_points.sort_points, [primitives.shapes, materials, lens, *seen], arrays)
         where = [light, maps, lens, points, first]
-        plants = light_plants.light_ground, light_plants.light_blades, light_plants.light_berries
-        for kernel in (light_points.light_sky, *plants):
+        is_level = primitives.model.terrain is None
+        ground = light_plants.light_ground if is_level else light_plants.light_uneven_ground
+        for kernel in (light_points.light_sky, ground, light_plants.light_blades, light_plants.light_berries):
             launch(kernel, [tables, materials, *where], [radiance])
         solid = [light, maps.near, maps.far, lens, points, first]
         launch(light_points.light_others, [primitives.shapes, materials, *solid], [radiance])

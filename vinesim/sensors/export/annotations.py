@@ -1,5 +1,4 @@
-"""Ground truth in file formats: JSON records, COCO with run-length masks, YOLO boxes, images of ids, and an overlay to
-look at."""
+"""Ground truth in file formats: JSON records, COCO, YOLO, images of ids, and an overlay to look at."""
 
 from __future__ import annotations
 
@@ -10,10 +9,12 @@ from typing import Any
 import cv2
 import numpy as np
 
+from vinesim.core.version import __version__
 from vinesim.scene.berries import VARIETIES
 from vinesim.scene.camera_geometry import distortion_model, intrinsic_matrix
-from vinesim.scene.ids import ObjectKind, object_id, object_name
+from vinesim.scene.ids import LABEL_STRIDE, ObjectKind, Organ, object_id, object_name
 from vinesim.scene.values import MIN_BERRY_PIXELS, Box, BunchTruth, CameraInfo
+from vinesim.sensors.export.outlines import join_polygons, mask_polygons
 from vinesim.sensors.ground_truth import PixelBuffers
 
 _EXTRA_FIELDS = ("occlusion", "bunch", "tree", "variety", "ripeness", "attached", "berries", "berries_seen")
@@ -29,6 +30,38 @@ CATEGORY = 1
 """Id of the only category, bunches, in COCO files, whose ids begin with 1 by convention."""
 CATEGORIES = [{"id": CATEGORY, "name": "bunch", "supercategory": "vine", "keypoints": ["cut"], "skeleton": []}]
 """List of categories for COCO files."""
+LICENSES = [{"id": 1, "name": "Apache-2.0", "url": "https://www.apache.org/licenses/LICENSE-2.0"}]
+"""List of licences for COCO files: that of vinesim, for all images."""
+SEGMENTATIONS = ("polygons", "rle", "compressed")
+"""Forms of ``segmentation`` in COCO files: polygons, run lengths as a list, and run lengths as text."""
+YOLO_TASKS = ("detect", "segment", "pose")
+"""Forms of YOLO label files, by the names of Ultralytics' tasks: box, polygon, and box with cut point."""
+
+SEMANTIC_CLASSES = (
+    "sky",
+    "soil",
+    "grass",
+    "leaf",
+    "cane",
+    "trunk",
+    "arm",
+    "wire",
+    "post",
+    "peduncle",
+    "bunch",
+    "berry",
+    "person",
+    "robot",
+    "box",
+)
+"""Names of the classes in semantic images, by value of the pixel. ``bunch`` is the part of a bunch that is no berry."""
+_CLASS_OF_ORGAN = {
+    Organ.NOTHING: "sky",
+    Organ.GROUND: "soil",
+    Organ.POLE: "post",
+    Organ.HUMAN: "person",
+}
+"""Class of those organs that have another name than their class."""
 
 
 def encode_mask(mask: np.ndarray) -> dict[str, Any]:
@@ -37,6 +70,16 @@ def encode_mask(mask: np.ndarray) -> dict[str, Any]:
 
     encoded = coco.encode(np.asfortranarray(mask, np.uint8))
     return {"size": [int(n) for n in encoded["size"]], "counts": encoded["counts"].decode("ascii")}  # pyright: ignore[reportAttributeAccessIssue]  # bytes, not str
+
+
+def list_run_lengths(encoded: dict[str, Any]) -> dict[str, Any]:
+    """Returns a mask that :func:`encode_mask` encoded, with its run lengths as a list of numbers: down the columns,
+    first the number of pixels outside the mask."""
+    from pycocotools import mask as coco
+
+    pixels = coco.decode(encoded).ravel(order="F")  # pyright: ignore[reportArgumentType]
+    changes = np.flatnonzero(np.diff(pixels, prepend=0))
+    return {"size": encoded["size"], "counts": np.diff(changes, prepend=0, append=len(pixels)).tolist()}
 
 
 def camera_record(model: str, info: CameraInfo, pose: np.ndarray) -> dict[str, Any]:
@@ -79,6 +122,7 @@ def bunch_records(
             "box": _xywh(one.visible_box),
             "amodal_box": _xywh(one.amodal_box),
             "mask": encode_mask(one.mask(one.visible, info)),
+            "polygons": mask_polygons(one.mask(one.visible, info)),
             "amodal_mask": encode_mask(one.mask(one.amodal, info)),
             "berries": one.berries,
             "berries_seen": one.berries_seen,
@@ -114,15 +158,42 @@ def _xywh(box: Box | None) -> list[int] | None:
     return None if box is None else [box[0], box[1], box[2] - box[0] + 1, box[3] - box[1] + 1]
 
 
-def yolo_labels(bunches: list[dict[str, Any]], width: int, height: int) -> str:
-    """Returns the text of a YOLO label file: for each annotated bunch a line with class 0, and centre and size of its
-    visible bounding box as shares of the picture's width and height."""
+def yolo_labels(bunches: list[dict[str, Any]], width: int, height: int, task: str = "detect") -> str:
+    """Returns the text of a YOLO label file: a line for each annotated bunch, in shares of the picture's width and
+    height.
+
+    Args:
+        bunches: records of the picture's bunches.
+        width: width of the picture [px].
+        height: height of the picture [px].
+        task: one of :data:`YOLO_TASKS`. ``detect``: class 0, centre and size of the visible bounding box; ``segment``:
+            class 0 and one polygon around all visible parts; ``pose``: as ``detect``, then the cut point and 2 if it
+            is visible, 1 if it is hidden, or three zeros if it is not in the picture.
+    """
+    size = np.array([width, height], float)
     lines = []
     for one in annotated_bunches(bunches):
-        x, y, w, h = one["box"]
-        share = (x + 0.5 * w) / width, (y + 0.5 * h) / height, w / width, h / height
-        lines.append("0 " + " ".join(f"{s:.6f}" for s in share))
+        if task == "segment":
+            values = (np.array(join_polygons(one["polygons"])).reshape(-1, 2) / size).ravel()
+        else:
+            x, y, w, h = one["box"]
+            values = np.array([x + 0.5 * w, y + 0.5 * h, w, h]) / np.tile(size, 2)
+        words = ["0", *(f"{share:.6f}" for share in values)]
+        if task == "pose":
+            column, row, seen = _cut_keypoint(one, width, height)
+            place = (np.array([column, row]) + 0.5) / size if seen else np.zeros(2)  # the middle of pixel 0 is 0.5
+            words += [*(f"{share:.6f}" for share in place), str(seen)]
+        lines.append(" ".join(words))
     return "".join(f"{line}\n" for line in lines)
+
+
+def yolo_settings(splits: Iterable[str], task: str = "detect") -> str:
+    """Returns the text of ``data.yaml`` for Ultralytics, with a list of images ``SPLIT.txt`` for each of the
+    ``splits``."""
+    # Without `path`, Ultralytics uses the folder of data.yaml; a relative `path` would count from its working folder.
+    lists = "".join(f"{split}: {split}.txt\n" for split in splits)
+    keypoints = "kpt_shape: [1, 3]\nflip_idx: [0]\n" if task == "pose" else ""
+    return f"{lists}{keypoints}names:\n  0: bunch\n"
 
 
 def annotated_bunches(bunches: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -130,20 +201,31 @@ def annotated_bunches(bunches: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [one for one in bunches if one["pixels"] >= MIN_ANNOTATED_PIXELS]
 
 
-def coco_json(read: Callable[[], Iterable[dict[str, Any]]]) -> Iterator[str]:
+def coco_json(read: Callable[[], Iterable[dict[str, Any]]], seed: int, segmentation: str = "polygons") -> Iterator[str]:
     """Yield the text of a COCO instances (and keypoints) file, piece by piece, from the records of its images.
 
-    ``read`` returns an iterator of the records of all images, in order. It is called twice, so that only one record at
-    a time is in memory.
+    Args:
+        read: returns an iterator of the records of all images, in order. It is called twice, so that only one record
+            at a time is in memory.
+        seed: seed of the data set.
+        segmentation: form of the visible masks, one of :data:`SEGMENTATIONS`.
     """
-    info = {"description": "vinesim", "berry_pixels": MIN_BERRY_PIXELS, "least_pixels": MIN_ANNOTATED_PIXELS}
-    yield f'{{"info": {json.dumps(info)}, "licenses": [], "categories": {json.dumps(CATEGORIES)},\n"images": ['
+    info = {
+        "description": "vinesim",
+        "version": __version__,
+        "seed": seed,
+        "berry_pixels": MIN_BERRY_PIXELS,
+        "least_pixels": MIN_ANNOTATED_PIXELS,
+    }
+    yield f'{{"info": {json.dumps(info)},\n"licenses": {json.dumps(LICENSES)},\n'
+    yield f'"categories": {json.dumps(CATEGORIES)},\n"images": ['
     for number, one in enumerate(read()):
         image = {
             "id": one["image"],
             "file_name": one["file"],
             "width": one["camera"]["width"],
             "height": one["camera"]["height"],
+            "license": LICENSES[0]["id"],
             "split": one["split"],
             "camera": one["camera"],
         }
@@ -152,15 +234,13 @@ def coco_json(read: Callable[[], Iterable[dict[str, Any]]]) -> Iterator[str]:
     number = 0
     for one in read():
         for bunch in annotated_bunches(one["bunches"]):
-            yield (",\n" if number else "\n") + json.dumps(_annotation(number + 1, one, bunch))
+            yield (",\n" if number else "\n") + json.dumps(_annotation(number + 1, one, bunch, segmentation))
             number += 1
     yield "]}\n"
 
 
-def _annotation(number: int, image: dict[str, Any], bunch: dict[str, Any]) -> dict[str, Any]:
-    cut = bunch["cut_pixel"] or [-1.0, -1.0]
-    within = -0.5 <= cut[0] < image["camera"]["width"] - 0.5 and -0.5 <= cut[1] < image["camera"]["height"] - 0.5
-    point = [*cut, 2 if bunch["cut_seen"] else 1] if within else [0, 0, 0]
+def _annotation(number: int, image: dict[str, Any], bunch: dict[str, Any], segmentation: str) -> dict[str, Any]:
+    point = _cut_keypoint(bunch, image["camera"]["width"], image["camera"]["height"])
     return {
         "id": number,
         "image_id": image["image"],
@@ -168,18 +248,46 @@ def _annotation(number: int, image: dict[str, Any], bunch: dict[str, Any]) -> di
         "iscrowd": 0,
         "bbox": bunch["box"],
         "area": bunch["pixels"],
-        "segmentation": bunch["mask"],
+        "segmentation": _segmentation(bunch, segmentation),
         "keypoints": point,
-        "num_keypoints": int(within),
+        "num_keypoints": int(point[2] > 0),
         "amodal_bbox": bunch["amodal_box"],
         "amodal_segmentation": bunch["amodal_mask"],
         **{name: bunch[name] for name in _EXTRA_FIELDS},
     }
 
 
+def _segmentation(bunch: dict[str, Any], form: str) -> Any:
+    """Returns the visible mask of a bunch in one of the forms :data:`SEGMENTATIONS`."""
+    if form == "polygons":
+        return bunch["polygons"]
+    return list_run_lengths(bunch["mask"]) if form == "rle" else bunch["mask"]
+
+
+def _cut_keypoint(bunch: dict[str, Any], width: int, height: int) -> list[Any]:
+    """Returns column and row [px] of a bunch's cut point, and 2 if it is visible, 1 if it is hidden; zeros if it is not
+    in the picture."""
+    column, row = bunch["cut_pixel"] or (-1.0, -1.0)
+    if not (-0.5 <= column < width - 0.5 and -0.5 <= row < height - 0.5):
+        return [0, 0, 0]
+    return [column, row, 2 if bunch["cut_seen"] else 1]
+
+
 def encode_labels(labels: np.ndarray) -> np.ndarray:
     """Returns labels [height, width] encoded as RGB with ``id = R + 256 G + 65536 B``, as in COCO's panoptic images."""
     return np.stack([labels & 255, labels >> 8 & 255, labels >> 16 & 255], -1).astype(np.uint8)
+
+
+def encode_classes(seen: PixelBuffers) -> np.ndarray:
+    """Returns an image [height, width] uint8 with the index of each pixel's class in :data:`SEMANTIC_CLASSES`."""
+    index = {name: number for number, name in enumerate(SEMANTIC_CLASSES)}
+    table = np.array([index[_CLASS_OF_ORGAN.get(organ, organ.name.lower())] for organ in Organ], np.uint8)
+    organs = seen.labels // LABEL_STRIDE
+    classes = table[organs]
+    is_on_ground = (organs == Organ.GROUND) & (seen.primitive >= 0)  # the surface of the ground is no primitive
+    classes[is_on_ground] = index["grass"]
+    classes[seen.berries >= 0] = index["berry"]
+    return classes
 
 
 def encode_berry_numbers(seen: PixelBuffers) -> np.ndarray:

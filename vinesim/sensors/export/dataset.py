@@ -5,6 +5,9 @@ with equal results. An image is complete when its record exists, which is writte
 the record. Files that were deleted, truncated or partly copied are rendered again. Checksums would also find changed
 bytes, but would require reading the whole data set at every start; a check of sizes needs one system call for each
 file.
+
+The files that trainers read (COCO, YOLO) are made of the records after the last image, in the forms that they are asked
+for. So a finished data set takes another form without rendering.
 """
 
 from __future__ import annotations
@@ -24,9 +27,10 @@ from vinesim.core.version import __version__
 from vinesim.scene.berries import VARIETIES
 from vinesim.scene.camera_geometry import depth_millimetres
 from vinesim.scene.generation.vineyard import generate_uncached
-from vinesim.scene.ids import Organ, label
+from vinesim.scene.ids import LABEL_STRIDE, Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene, Season, sun_direction
+from vinesim.scene.terrain import ground_height
 from vinesim.scene.values import CameraInfo, RenderedMount, Snapshot
 from vinesim.sensors import ground_truth
 from vinesim.sensors.camera.camera import Camera, CameraSpec
@@ -56,9 +60,15 @@ LATITUDE = np.radians(41.6)
 """Latitude [rad] of the vineyards near Aprilia, Italy, where CANOPIES picks; it determines the sun's path."""
 MIN_ACTOR_SHARE = 0.01
 """Least share of a picture's pixels that show actors or boxes, in scenes that have any."""
+MIN_PLANT_SHARE = 0.02
+"""Least share of the pixels of a picture without bunches that show a plant."""
 _MAX_TRIES = 60
 _TRIES_WITH_ACTORS = 30
+_TRIES_WITHOUT_BUNCHES = 300
+_TRIES_UNTIL_DOWN = 60
 _FOLDERS = ("images", "labels", "depth", "measured", "ids", "berries", "records")
+_DERIVED_FOLDERS = ("labels", "records")
+"""Folders without files that an image's record lists."""
 _SUFFIXES = {"labels": ".txt", "records": ".json"}
 """File suffixes in the folders of a data set that do not contain PNG files."""
 SPLITS = ("train", "val", "test")
@@ -127,6 +137,15 @@ class DatasetPlan:
     device: str = "cpu"
     sensors: tuple[RenderedMount, ...] = ()
     """Further sensors, which are rendered from the camera's pose."""
+    negatives: float = 0.0
+    """Share of the pictures in which no bunch is visible, 0 to 1."""
+
+    semantic: bool = False
+    """Whether to write an image of the class of each pixel too, see :func:`annotations.encode_classes`."""
+
+    def is_negative(self, image: int) -> bool:
+        """Returns whether no bunch shall be visible in image ``image``."""
+        return bool(np.random.default_rng([self.seed, 7, image]).random() < self.negatives)
 
     def settings(self) -> dict[str, Any]:
         """Returns all settings that determine the images, for JSON."""
@@ -140,6 +159,8 @@ class DatasetPlan:
             "device": self.device.partition(":")[0],  # without the index, because all GPUs render equal images
             "life": None if self.snapshot_source is None else self.snapshot_source.settings(),
             "sensors": {m.name: {"kind": m.kind} | msgspec.to_builtins(m) for m in self.sensors} or None,
+            "negatives": self.negatives,
+            "semantic": dict(enumerate(formats.SEMANTIC_CLASSES)) if self.semantic else None,
         }
 
     def vineyard(self, number: int) -> Scene:
@@ -174,7 +195,11 @@ class VineyardRenderer:
         rng = np.random.default_rng([self.plan.seed, 2, image])
         hour, sun = _random_sun(rng)
         snapshot, near, activity = self._pose_scene(image)
-        seen = self._choose_view(rng, snapshot, near, [(one["x"], one["y"]) for one in activity.get("actors", [])])
+        is_negative = self.plan.is_negative(image)
+        if is_negative:
+            seen = self._choose_view_without_bunches(rng, snapshot, near)
+        else:
+            seen = self._choose_view(rng, snapshot, near, [(one["x"], one["y"]) for one in activity.get("actors", [])])
         truths = ground_truth.bunch_truths(self.primitives, snapshot, seen, self.caster)
         camera = Camera(
             self.spec,
@@ -195,6 +220,7 @@ class VineyardRenderer:
             "image": image,
             "file": _file_of("images", image),
             "split": split_of(image),
+            "negative": is_negative,
             "scene": {
                 "name": self.scene.name,
                 "seed": self.scene.seed,
@@ -214,13 +240,14 @@ class VineyardRenderer:
             "ids": formats.encode_labels(frame.labels),
             "berries": formats.encode_berry_numbers(seen),
         }
+        if self.plan.semantic:
+            pixels["semantic"] = formats.encode_classes(seen)
         setting = SensorSetting(sun, self.plan.seed, image, self.plan.device, threads=1)
         for mount in self.plan.sensors:
             kept = export_frame(mount, self.primitives, snapshot, seen.pose, setting)
             pixels |= {f"{mount.name}/{name}": values for name, values in kept.images.items()}
             record.setdefault("sensors", {})[mount.name] = kept.record
         files = {_file_of(kind, image): picture.encode_png(values) for kind, values in pixels.items()}
-        files[_file_of("labels", image)] = formats.yolo_labels(bunches, self.info.width, self.info.height).encode()
         record["files"] = {name: len(data) for name, data in files.items()}
         files[_file_of("records", image)] = formats.json_text(record).encode()
         for kind in pixels:
@@ -249,33 +276,25 @@ class VineyardRenderer:
         ``near``: point [2] m of the ground near which the bunch hangs; ``actors``: positions [m], one of which is in
         view too, unless too many tries fail.
         """
-        model = self.model
-        hanging = np.flatnonzero(snapshot.bunch_attached)
-        if near is not None:
-            away = np.linalg.norm(snapshot.body_q[model.bunch_body[hanging], :2] - near, axis=1)
-            hanging = hanging[away < MAX_ACTOR_DISTANCE] if (away < MAX_ACTOR_DISTANCE).any() else hanging
-        if not len(hanging):
-            raise DatasetError(f"scene {self.scene.name!r} bears too few bunches; raise fruit.bunches")
+        hanging = self._hanging_bunches(snapshot, near)
         for attempt in range(_MAX_TRIES):
             bunch = int(hanging[rng.integers(len(hanging))])
-            pose = snapshot.body_q[model.bunch_body[bunch]].astype(float)
-            middle = pose[:3] + frames.rotate(pose[3:], np.array([0.5 * model.bunch_length[bunch], 0.0, 0.0]))
+            middle = self._middle_of_bunch(snapshot, bunch)
             height = rng.uniform(*CAMERA_HEIGHT)
             away = rng.uniform(*BUNCH_DISTANCE)
             around = rng.uniform(0.0, 2.0 * np.pi)
             if actors and attempt < _TRIES_WITH_ACTORS:  # look from the side opposite to an actor
                 behind = np.array(actors[rng.integers(len(actors))]) - middle[:2]
                 around = np.arctan2(-behind[1], -behind[0]) + rng.normal(0.0, 0.3)
+            height += float(ground_height(model.terrain, *middle[:2]))
             rise = height - middle[2]
             level = np.sqrt(max(away**2 - rise**2, rise**2))  # never steeper than 45 degrees
             eye = np.array([*(middle[:2] + level * np.array([np.cos(around), np.sin(around)])), height])
             aim = middle + rng.normal(0.0, 0.12, 3) * min(away, 1.0)
             roll = frames.exp(np.array([0.0, 0.0, rng.normal(0.0, 0.03)]))
-            if np.linalg.norm(aim - eye) < 0.1 or enclosing_primitive(self.primitives, eye) >= 0:
+            seen = self._look(eye, aim, roll)
+            if seen is None:
                 continue
-            optical = picture.look_at(eye, aim)
-            optical[3:] = frames.multiply(optical[3:], roll)
-            seen = ground_truth.render_buffers(self.primitives, self.info, optical)
             shown = (seen.labels == label(Organ.BUNCH, bunch)).sum()
             if (
                 actors
@@ -283,9 +302,66 @@ class VineyardRenderer:
                 and (seen.labels >= label(Organ.BOX, 0)).mean() < MIN_ACTOR_SHARE
             ):
                 continue
-            if (seen.depth < MIN_CLEARANCE).mean() < 0.02 and shown >= formats.MIN_ANNOTATED_PIXELS:
+            if shown >= formats.MIN_ANNOTATED_PIXELS:
                 return seen
         raise DatasetError(f"scene {self.scene.name!r} has no open place near its bunches, in {_MAX_TRIES} tries")
+
+    def _choose_view_without_bunches(
+        self, rng: np.random.Generator, snapshot: Snapshot, near: np.ndarray | None
+    ) -> ground_truth.PixelBuffers:
+        """Returns a view from a free place near a random hanging bunch, in a direction in which a plant is visible, but
+        no bunch.
+
+        ``near``: point [2] m of the ground near which the bunch hangs.
+        """
+        hanging = self._hanging_bunches(snapshot, near)
+        for attempt in range(_TRIES_WITHOUT_BUNCHES):
+            middle = self._middle_of_bunch(snapshot, int(hanging[rng.integers(len(hanging))]))
+            bearing, heading = rng.uniform(0.0, 2.0 * np.pi, 2)
+            away = rng.uniform(*BUNCH_DISTANCE)
+            eye = np.array([*(middle[:2] + away * np.array([np.cos(bearing), np.sin(bearing)])), 0.0])
+            eye[2] = rng.uniform(*CAMERA_HEIGHT)
+            # Bunches hang at the height of the camera. So later tries look farther down, at trunks and the ground.
+            pitch = rng.uniform(-0.3, 0.3) - 0.9 * min(attempt / _TRIES_UNTIL_DOWN, 1.0)
+            level = np.array([np.cos(heading), np.sin(heading), 0.0])
+            aim = eye + np.cos(pitch) * level + [0.0, 0.0, np.sin(pitch)]
+            seen = self._look(eye, aim, frames.exp(np.array([0.0, 0.0, rng.normal(0.0, 0.03)])))
+            if seen is None:
+                continue
+            organs = seen.labels // LABEL_STRIDE
+            is_plant = (organs >= Organ.TRUNK) & (organs <= Organ.LEAF)
+            if not (organs == Organ.BUNCH).any() and is_plant.mean() >= MIN_PLANT_SHARE:
+                return seen
+        raise DatasetError(
+            f"scene {self.scene.name!r} has no view of a plant without bunches, in {_TRIES_WITHOUT_BUNCHES} tries; "
+            "lower fruit.bunches, or give --negatives 0"
+        )
+
+    def _hanging_bunches(self, snapshot: Snapshot, near: np.ndarray | None) -> np.ndarray:
+        """Returns the indices of the hanging bunches; if possible only of those around the point ``near`` [2] m of the
+        ground."""
+        hanging = np.flatnonzero(snapshot.bunch_attached)
+        if near is not None:
+            away = np.linalg.norm(snapshot.body_q[self.model.bunch_body[hanging], :2] - near, axis=1)
+            hanging = hanging[away < MAX_ACTOR_DISTANCE] if (away < MAX_ACTOR_DISTANCE).any() else hanging
+        if not len(hanging):
+            raise DatasetError(f"scene {self.scene.name!r} bears too few bunches; raise fruit.bunches")
+        return hanging
+
+    def _middle_of_bunch(self, snapshot: Snapshot, bunch: int) -> np.ndarray:
+        """Returns the middle [3] m of a bunch's rachis."""
+        pose = snapshot.body_q[self.model.bunch_body[bunch]].astype(float)
+        return pose[:3] + frames.rotate(pose[3:], np.array([0.5 * self.model.bunch_length[bunch], 0.0, 0.0]))
+
+    def _look(self, eye: np.ndarray, aim: np.ndarray, roll: np.ndarray) -> ground_truth.PixelBuffers | None:
+        """Returns the view from ``eye`` [3] m to ``aim`` [3] m, turned by the quaternion ``roll`` [4]; None if the
+        place is not free, or something is too near."""
+        if np.linalg.norm(aim - eye) < 0.1 or enclosing_primitive(self.primitives, eye) >= 0:
+            return None
+        optical = picture.look_at(eye, aim)
+        optical[3:] = frames.multiply(optical[3:], roll)
+        seen = ground_truth.render_buffers(self.primitives, self.info, optical)
+        return seen if (seen.depth < MIN_CLEARANCE).mean() < 0.02 else None
 
 
 def _random_sun(rng: np.random.Generator) -> tuple[float, tuple[float, float, float]]:
@@ -373,7 +449,7 @@ def missing_images(folder: pathlib.Path, images: int) -> list[int]:
 
 def _is_whole(folder: pathlib.Path, image: int) -> bool:
     """Returns whether the record of an image exists, and each of the image's files has the size in the record."""
-    expected = {_file_of(kind, image) for kind in _FOLDERS if kind != "records"}
+    expected = {_file_of(kind, image) for kind in _FOLDERS if kind not in _DERIVED_FOLDERS}
     try:
         record = msgspec.json.decode((folder / _file_of("records", image)).read_bytes(), type=_RecordedFiles)
         return record.files.keys() >= expected and all(
@@ -401,31 +477,42 @@ def render_images(plan: DatasetPlan, folder: pathlib.Path, images: Iterable[int]
         yield image
 
 
-def finish(folder: pathlib.Path, images: int) -> pathlib.Path:
-    """Write ``annotations.json`` (COCO) from the records of the first ``images`` images, ``data.yaml`` (YOLO) and the
-    lists of images that ``data.yaml`` names, one for each split that has images.
+def finish(folder: pathlib.Path, images: int, segmentation: str = "polygons", yolo: str = "detect") -> pathlib.Path:
+    """Write the files that trainers read, from the records of the first ``images`` images: ``annotations.json`` (COCO),
+    and for YOLO the folder ``labels``, ``data.yaml`` and the lists of images that it names, one for each split that has
+    images.
+
+    Args:
+        folder: folder of the data set.
+        images: number of images.
+        segmentation: form of the masks in ``annotations.json``, one of :data:`annotations.SEGMENTATIONS`.
+        yolo: task that the labels are for, one of :data:`annotations.YOLO_TASKS`.
 
     Returns the path of ``annotations.json``. Raises :class:`WriteError` if one of the files cannot be written; then no
     file is written.
     """
 
-    def read() -> Iterator[dict[str, Any]]:
-        for number in range(images):
-            yield json.loads((folder / _file_of("records", number)).read_text(encoding="utf-8"))
+    def record(number: int) -> dict[str, Any]:
+        return json.loads((folder / _file_of("records", number)).read_text(encoding="utf-8"))
+
+    def labels(number: int) -> Iterator[bytes]:
+        one = record(number)
+        yield formats.yolo_labels(one["bunches"], one["camera"]["width"], one["camera"]["height"], yolo).encode()
 
     target = folder / "annotations.json"
-    # Without `path`, Ultralytics uses the folder of data.yaml; a relative `path` would count from its working folder.
+    seed = json.loads((folder / "dataset.json").read_text(encoding="utf-8"))["seed"]
+    coco = formats.coco_json(lambda: map(record, range(images)), seed, segmentation)
+    files: dict[pathlib.Path, Iterable[bytes]] = {target: map(str.encode, coco)}
+    files |= {folder / _file_of("labels", number): labels(number) for number in range(images)}
     some = [split for split in SPLITS if split_needs(split) <= images]
-    yaml = "".join(f"{split}: {split}.txt\n" for split in some) + "names:\n  0: bunch\n"
-    files: dict[pathlib.Path, Iterable[bytes]] = {target: map(str.encode, formats.coco_json(read))}
     for split in some:  # `./` is relative to the list
         names = [f"./{_file_of('images', n)}\n" for n in range(images) if split_of(n) == split]
         files[folder / f"{split}.txt"] = map(str.encode, names)
-    files[folder / "data.yaml"] = [yaml.encode()]
+    files[folder / "data.yaml"] = [formats.yolo_settings(some, yolo).encode()]
     try:
         write_files(files)
     except OSError as bad:
-        raise _not_written("annotations.json and the lists", folder, bad) from None
+        raise _not_written("annotations.json, the labels and the lists", folder, bad) from None
     return target
 
 

@@ -11,6 +11,7 @@ from vinesim.core import frames
 from vinesim.scene.camera_geometry import depth_millimetres
 from vinesim.scene.ids import LABEL_STRIDE, Organ
 from vinesim.scene.model import Model
+from vinesim.scene.terrain import ground_height
 from vinesim.scene.values import CameraFrame, CameraInfo, Snapshot
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.camera.sunlight import DEFAULT_SUN
@@ -76,12 +77,12 @@ def label_colours(labels: np.ndarray) -> np.ndarray:
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """Returns an image, RGB uint8 or grey uint16, encoded as PNG; :class:`ValueError` for other types."""
+    """Returns an image, RGB uint8, or grey uint8 or uint16, encoded as PNG; :class:`ValueError` for other types."""
     data = image[..., ::-1] if image.ndim == 3 else image
     done, encoded = cv2.imencode(".png", np.ascontiguousarray(data))
     if not done:
         raise ValueError(
-            f"an image of shape {image.shape}, {image.dtype}, cannot be a PNG; give uint8 RGB or uint16 grey"
+            f"an image of shape {image.shape}, {image.dtype}, cannot be a PNG; give uint8 RGB, or uint8 or uint16 grey"
         )
     return encoded.tobytes()
 
@@ -120,7 +121,10 @@ def overview_pose(model: Model) -> np.ndarray:
     high = spots.max(0)
     middle = 0.5 * (low + high)
     eye = np.array([low[0] - 0.6, middle[1] - 0.25, 1.45])
-    return look_at(eye, np.array([high[0], middle[1] + 0.1, 1.40]))
+    target = np.array([high[0], middle[1] + 0.1, 1.40])
+    for point in (eye, target):
+        point[2] += ground_height(model.terrain, *point[:2])
+    return look_at(eye, target)
 
 
 def render_overview(

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Callable
 from typing import Annotated, Literal, Protocol
 
@@ -127,6 +128,29 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
             )
         return spec
 
+    def mounted(self, mount: LidarMount) -> LidarSpec:
+        """Returns the data sheet with the values that a robot's ``mount`` gives instead."""
+        spec = self if mount.noise is None else self.ideal()
+
+        def but(name: str, value: float) -> dict[str, Number]:
+            return {name: msgspec.structs.replace(getattr(spec, name), value=value)}
+
+        given: dict[str, object] = {}
+        if mount.noise is not None:
+            given |= but("noise", mount.noise) | but("weak_noise", mount.noise)
+        if mount.range is not None:
+            given |= but("nearest", mount.range[0]) | but("farthest", mount.range[1])
+        if mount.elevations is not None:
+            degrees = tuple(math.degrees(angle) for angle in mount.elevations)
+            given |= {"elevation": msgspec.structs.replace(spec.elevation, value=degrees), "azimuth": None}
+        if mount.columns is not None or mount.elevations is not None:
+            rate = mount.rate or self.rate.value
+            columns = mount.columns or round(1.0 / (self.rate.value * self.firing_period.value))
+            period = 1.0 / (rate * columns)
+            lasers = len(mount.elevations or self.elevation.value)
+            given |= but("rate", rate) | but("firing_period", period) | but("laser_period", period / lasers)
+        return msgspec.structs.replace(spec, **given)
+
     def ideal(self) -> LidarSpec:
         """Returns the data sheet of an ideal lidar with the same firing times and angles: its beams have no width, it
         measures exactly, and it detects every echo."""
@@ -193,6 +217,8 @@ class Lidar:
         that has begun already is not affected."""
         self.revolution = 0
         """Index of the present revolution."""
+        self.sector: tuple[float, float] | None = None
+        """First and last azimuth of the returns that are reported, counter-clockwise from ahead [rad]; None: all."""
         self.lasers = len(spec.elevation.value)
         self.firing_period = spec.firing_period.value
         """Time between two firings [s]."""
@@ -343,6 +369,7 @@ class Lidar:
                 primitives.labels,
                 primitives.organs,
                 self._receiver,
+                primitives.ground,
                 first * self.lasers,
                 wp.transform(*map(float, pose)),
                 grid.direction,
@@ -361,6 +388,11 @@ class Lidar:
         in the world at its first firing, and time of this firing."""
         labels = self._label.numpy()
         shot, which = np.nonzero(labels >= 0)
+        if self.sector is not None:
+            points = self._xyz.numpy()[shot, which]
+            beyond_first = (np.arctan2(points[:, 1], points[:, 0]) - self.sector[0]) % (2.0 * np.pi)
+            seen = beyond_first <= self.sector[1] - self.sector[0]
+            shot, which = shot[seen], which[seen]
         self.revolution += 1
         return LidarScan(
             time=float(time),
@@ -378,9 +410,10 @@ class Lidar:
 
 
 def _make(mount: LidarMount, setting: SensorSetting) -> Lidar:
-    spec = LidarSpec.load(mount.type)
+    spec = LidarSpec.load(mount.type).mounted(mount)
     lidar = Lidar(spec, mount.name, mount.frame, setting.device, seed=setting.seed, threads=setting.threads)
     lidar.revolution = setting.number
+    lidar.sector = mount.sector
     return lidar
 
 

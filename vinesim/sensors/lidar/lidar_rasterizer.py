@@ -116,7 +116,7 @@ class LidarRasterizer:
         wp.launch(
             lidar_raster.resolve_keys,
             count * self.rows // run,
-            inputs=[self._keys, head, run],
+            inputs=[primitives.ground, self._keys, head, run],
             outputs=[self.distance, self.primitive],
             device=self.device,
         )

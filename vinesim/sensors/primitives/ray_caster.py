@@ -61,6 +61,7 @@ class RayCaster:
         self.primitives = primitives
         self._layout_version = self._pose_version = -1
         self._struct = ray_cast.Hierarchies()
+        self._struct.ground = primitives.ground
         self._refit()
 
     def hierarchies(self) -> ray_cast.Hierarchies:

@@ -15,12 +15,13 @@ import numpy as np
 import warp as wp
 
 from vinesim.core import disk_cache, frames
-from vinesim.kernels.raster import primitives, transform_primitives
+from vinesim.kernels.raster import ground, primitives, transform_primitives
 from vinesim.kernels.shading import materials
 from vinesim.scene import berries
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
+from vinesim.scene.terrain import Terrain
 from vinesim.scene.values import RigidVisual, Shape, Snapshot
 from vinesim.sensors.primitives import textures
 from vinesim.sensors.primitives.bunch_primitives import Ripeness, bunch_batches, bunch_bodies
@@ -68,6 +69,7 @@ _TEXTURES = (
     "ground_x",
     "ground_y",
     "ground_cell",
+    "ground",
 )
 """Fields of ``Materials`` that do not depend on the primitives: textures, rows of vines, visible sky above the ground.
 """
@@ -122,7 +124,10 @@ class Primitives:
         """Columns of the tables of primitives and clusters, by name, with spare capacity for rigid bodies."""
         self._poses = np.zeros((0, 7), np.float32)
         self._textures = materials.Materials()
+        self.ground = ground_struct(model.terrain, device)
+        """The uneven ground; without nodes the ground is the plane z = 0."""
         self._textures.rows = wp.vec2(*row_layout(model))
+        self._textures.ground = self.ground
         self._textures.leaf_texture, self._textures.noise_texture, self._textures.soil_texture = (
             wp.array(table, dtype=wp.vec4, device=device)
             for table in (textures.leaf_texture(), textures.noise_texture(), textures.soil_texture())
@@ -189,7 +194,7 @@ class Primitives:
         posed = self.shapes.a.numpy()
         kind = self.shapes.kind.numpy()
         blades = posed[(layout.organ == int(Organ.LEAF)) & (kind == LEAF)]
-        canopy = LeafDensity(blades, low, high, self.device)
+        canopy = LeafDensity(blades, low, high, self.device, self.model.terrain)
         # cones also store the visible sky at their far end, so that light is continuous from segment to segment
         wood = np.flatnonzero(kind == CONE)
         far = canopy.visible_sky(self.shapes.b.numpy()[wood, :3])
@@ -197,8 +202,9 @@ class Primitives:
         baked["sky"] = canopy.visible_sky(posed[:, :3])
         step = _ground_step(low, high)
         x, y = np.meshgrid(np.arange(low[0], high[0], step), np.arange(low[1], high[1], step))
-        ground = canopy.visible_sky(np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.05)], 1))
-        baked["ground_sky"] = ground.reshape(x.shape)
+        height = 0.05 if self.model.terrain is None else self.model.terrain.height(x.ravel(), y.ravel()) + 0.05
+        sky = canopy.visible_sky(np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], 1))
+        baked["ground_sky"] = sky.reshape(x.shape)
         return baked
 
     def _plant_batches(self, grass: float, low: np.ndarray, high: np.ndarray) -> list[Batch]:
@@ -213,7 +219,8 @@ class Primitives:
         around = [*trellis_batches(model, static), wire_batch(model, self._wires, self._bodies, len(model.tree_first))]
         if grass > 0.0:
             age = float(model.leaf_age.mean()) if len(model.leaf_age) else 0.0
-            around += [grass_batch(row_layout(model), low, high, grass, static), litter_batch(low, high, age, static)]
+            tufts = grass_batch(row_layout(model), low, high, grass, static, model.terrain)
+            around += [tufts, litter_batch(low, high, age, static, model.terrain)]
         batches += [b for b in around if b is not None]
         return [b for b in batches if len(b)] or [placeholder_batch(static)]
 
@@ -462,6 +469,20 @@ def _clusters_shown(bunch: np.ndarray, attached: np.ndarray) -> np.ndarray:
     if not len(attached):
         return np.ones(len(bunch), np.int32)
     return ((bunch < 0) | attached[bunch]).astype(np.int32)
+
+
+def ground_struct(terrain: Terrain | None, device: str) -> ground.Ground:
+    """Returns the kernel struct of the uneven ground; without nodes if ``terrain`` is None."""
+    struct = ground.Ground()
+    nodes = np.zeros((0, 0), np.float32) if terrain is None else terrain.residual
+    struct.residual = wp.array(nodes, dtype=float, device=device)
+    if terrain is not None:
+        struct.x, struct.y = terrain.origin
+        struct.cell = terrain.cell
+        struct.slope_x, struct.slope_y = terrain.slope
+        struct.low = float(nodes.min())
+        struct.high = float(nodes.max())
+    return struct
 
 
 def _ground_extent(model: Model) -> tuple[np.ndarray, np.ndarray]:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from vinesim.core import frames
 from vinesim.kernels.shading import materials
 from vinesim.scene import leaves
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
+from vinesim.scene.terrain import Terrain, ground_height
 from vinesim.sensors.primitives import textures
 from vinesim.sensors.primitives.primitive_batches import Batch, make_batch, stack_columns
 from vinesim.sensors.raster.primitive_arrays import CONE, LEAF
@@ -108,7 +110,9 @@ def _row_greenness(rows: tuple[float, float], y: np.ndarray) -> np.ndarray:
     return 0.16 - 0.26 * textures.smoothstep(0.65, 0.25, away) - 0.14 * textures.smoothstep(0.22, 0.08, track)
 
 
-def litter_batch(low: np.ndarray, high: np.ndarray, age: float, static_carrier: int) -> Batch | None:
+def litter_batch(
+    low: np.ndarray, high: np.ndarray, age: float, static_carrier: int, terrain: Terrain | None = None
+) -> Batch | None:
     """Returns the primitives of fallen leaves on the ground between the corners ``low`` and ``high`` [2] m.
 
     Their number grows with ``age``, the mean of :attr:`Model.leaf_age`; None without fallen leaves.
@@ -125,6 +129,8 @@ def litter_batch(low: np.ndarray, high: np.ndarray, age: float, static_carrier: 
     rib = np.stack([np.cos(turn), np.sin(turn), tilt], 1) / np.hypot(1.0, tilt)[:, None]
     up = np.cross(rib, np.stack([np.sin(turn), -np.cos(turn), rng.normal(0.0, 0.15, n)], 1))
     up /= np.linalg.norm(up, axis=1, keepdims=True)
+    if terrain is not None:
+        rib, up = _lying(terrain, position, rib, up)
     dry = rng.uniform(size=(n, 1))
     tint = (1.0 - dry) * np.array([0.30, 0.24, 0.05]) + dry * np.array([0.17, 0.10, 0.045])
     bend = stack_columns(
@@ -132,7 +138,7 @@ def litter_batch(low: np.ndarray, high: np.ndarray, age: float, static_carrier: 
     )
     return make_batch(
         LEAF,
-        stack_columns(position, np.full(n, 0.012), rng.uniform(0.04, 0.085, n)),
+        stack_columns(position, 0.012 + ground_height(terrain, *position.T), rng.uniform(0.04, 0.085, n)),
         b=stack_columns(rib, leaves.blade_shape(np.arange(n))),
         c=stack_columns(up, rng.uniform(size=n)),
         d=bend,
@@ -146,7 +152,12 @@ def litter_batch(low: np.ndarray, high: np.ndarray, age: float, static_carrier: 
 
 
 def grass_batch(
-    rows: tuple[float, float], low: np.ndarray, high: np.ndarray, density: float, static_carrier: int
+    rows: tuple[float, float],
+    low: np.ndarray,
+    high: np.ndarray,
+    density: float,
+    static_carrier: int,
+    terrain: Terrain | None = None,
 ) -> Batch | None:
     """Returns the primitives of grass tufts and herbs, with the ground's label, on the green parts of the ground.
 
@@ -171,7 +182,7 @@ def grass_batch(
     out = np.stack([np.cos(yaw), np.sin(yaw), np.zeros(n)], 1)
     rib = np.sin(lean)[:, None] * out + np.cos(lean)[:, None] * np.array([0.0, 0.0, 1.0])
     up = np.cos(lean)[:, None] * out - np.sin(lean)[:, None] * np.array([0.0, 0.0, 1.0])
-    root = stack_columns(position, np.zeros(n)) + 0.74 * size[:, None] * rib
+    root = stack_columns(position, ground_height(terrain, *position.T)) + 0.74 * size[:, None] * rib
     tint = np.array([0.075, 0.12, 0.022]) * rng.uniform(0.6, 1.35, (n, 1))
     tint = tint + np.array([0.10, 0.07, 0.02]) * (rng.uniform(size=(n, 1)) < 0.3) * rng.uniform(size=(n, 1))
     bend = stack_columns(rng.normal(0.0, 0.3, n), np.zeros(n), np.zeros(n), np.zeros(n))
@@ -188,3 +199,15 @@ def grass_batch(
         carrier=static_carrier,
         group=_ground_cells(position, 0),
     )
+
+
+def _lying(terrain: Terrain, position: np.ndarray, *directions: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Returns unit vectors ``directions`` [n, 3] turned with the slope of the ground at ``position`` [n, 2] m."""
+    axes = frames.from_matrix(_upright_axes(terrain.normal(*position.T)))
+    return tuple(frames.rotate(axes, one) for one in directions)
+
+
+def _upright_axes(normal: np.ndarray) -> np.ndarray:
+    """Returns rotation matrices [n, 3, 3] that turn z to ``normal`` [n, 3] and keep x in its vertical plane."""
+    x = frames.normalize(np.stack([normal[:, 2], np.zeros(len(normal)), -normal[:, 0]], -1))
+    return np.stack([x, frames.cross(normal, x), normal], -1)

@@ -162,7 +162,7 @@ class CameraRasterizer:
             self.width * (lens.end_row - lens.first_row) // run,
             inputs=[
                 primitives.labels,
-                self.keys,
+                primitives.ground,
                 lens,
                 label(Organ.GROUND, 0),
                 float(nearest),
@@ -171,7 +171,7 @@ class CameraRasterizer:
                 float("inf"),
                 run,
             ],
-            outputs=[self.primitive, self.depth, self.labels],
+            outputs=[self.keys, self.primitive, self.depth, self.labels],
             device=self.device,
         )
 

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.kernels.raster import primitives
+from vinesim.kernels.raster.ground import Ground
 from vinesim.kernels.raster.pinhole import Pinhole
 
 CONE, SPHEROID, LEAF, BOX, ELLIPSOID, CYLINDER, TRIANGLE = (
@@ -41,6 +42,8 @@ class PosedPrimitives(Protocol):
     device: str
     shapes: primitives.Shapes
     clusters: primitives.Clusters
+    ground: Ground
+    """The uneven ground; without nodes the ground is the plane z = 0."""
     ball: wp.array
     """[cluster] vec4, bounding sphere: centre and radius [m]. The radius of a hidden cluster is negative."""
     labels: wp.array

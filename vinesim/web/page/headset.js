@@ -30,10 +30,11 @@ export class Headset {
   /**
    * `rig` carries camera and controllers: the floor that the person stands on. `poses`: finger poses of the buttons a
    * and b; `press(side)` is called when a stick is pressed, or a hand without a controller closes at the hip;
-   * `choose()` when the right stick is pulled back.
+   * `choose()` when the right stick is pulled back; `floor(x, y)` returns the height of the ground [m].
    */
-  constructor(renderer, rig, camera, poses, press, choose) {
+  constructor(renderer, rig, camera, poses, press, choose, floor) {
     this.poses = poses;
+    this.floor = floor;
     this.press = press;
     this.choose = choose;
     this.wrist = new THREE.Group(); // goes with the left hand
@@ -81,7 +82,7 @@ export class Headset {
       requiredFeatures: ["local-floor"],
       optionalFeatures: ["hand-tracking"],
     });
-    this.rig.position.set(place[0], 0, -place[1]);
+    this.rig.position.set(place[0], this.floor(place[0], place[1]), -place[1]);
     this.rig.rotation.y = yaw - Math.PI / 2;
     await this.renderer.xr.setSession(session);
   }
@@ -114,6 +115,7 @@ export class Headset {
         const [c, s] = this.heading();
         this.rig.position.x += WALK * seconds * (-y * c + x * s);
         this.rig.position.z -= WALK * seconds * (-y * s - x * c);
+        this.stand();
       }
       if (source?.handedness === "right") {
         if (y < -AIM || (this.mark.visible && y < -DEAD)) this.aim(this.rays[k]);
@@ -133,7 +135,7 @@ export class Headset {
   aim(ray) {
     const from = new THREE.Vector3().setFromMatrixPosition(ray.matrixWorld);
     const way = new THREE.Vector3(0, 0, -1).transformDirection(ray.matrixWorld);
-    const distance = way.y < -FLATTEST ? -from.y / way.y : Infinity;
+    const distance = way.y < -FLATTEST ? (this.rig.position.y - from.y) / way.y : Infinity;
     this.mark.visible = distance < FARTHEST;
     if (this.mark.visible) this.mark.position.copy(from).addScaledVector(way, distance);
   }
@@ -141,8 +143,15 @@ export class Headset {
   /** Move the floor so that the head is above the mark. */
   jump() {
     const head = new THREE.Vector3().setFromMatrixPosition(this.viewer).applyMatrix4(this.rig.matrixWorld);
-    this.rig.position.add(this.mark.position).sub(head).setY(0);
+    this.rig.position.add(this.mark.position).sub(head);
+    this.stand();
     this.mark.visible = false;
+  }
+
+  /** Put the floor at the height of the ground below the head. */
+  stand() {
+    const [x, y] = this.head();
+    this.rig.position.y = this.floor(x, y);
   }
 
   /** Returns a hand that the headset tracks: palm on the rig, bend of each finger, whether it is closed; null: not tracked. */

@@ -357,7 +357,7 @@ uniform sampler2D groundSky;
 uniform vec3 ground;   // lowest x and y, side of a cell
 uniform vec2 rows;     // y of the first row of vines, distance of rows
 
-Surface soil(vec2 p) {
+Surface soil(vec2 p, vec2 rise) {
   vec2 size = vec2(textureSize(groundSky, 0)), cell = (p - ground.xy) / ground.z, last = size - 1.0;
   float beyond = min(min(cell.x, cell.y), min(last.x - cell.x, last.y - cell.y)) * ground.z;
   float inside = smoothstep(0.0, 3.0, beyond), outside = 1.0 - inside;
@@ -377,7 +377,7 @@ Surface soil(vec2 p) {
   vec3 earth = mix(vec3(0.11, 0.072, 0.042), vec3(0.28, 0.195, 0.12), clamp(tone, 0.0, 1.0));
   vec3 turf = mix(vec3(0.035, 0.055, 0.014), vec3(0.13, 0.15, 0.042), clamp(sod, 0.0, 1.0));
   turf = mix(turf, vec3(0.055, 0.085, 0.022), outside * smoothstep(0.35, 0.6, fields.z));
-  vec2 slope = vec2(near.w - near.y, near.z - near.y);
+  vec2 slope = vec2(near.w - near.y, near.z - near.y) - rise;
   Surface s = diffuse(normalize(vec3(slope, 1.0)), mix(earth, turf, green) * (0.8 + 0.4 * coarse.y), sky);
   s.occlusion = 0.6 + 0.8 * min(tone, 0.5);
   s.specular = 0.0;

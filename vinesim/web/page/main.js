@@ -84,7 +84,8 @@ class Viewer {
     this.scene.add(world.group);
     this.camera = new THREE.PerspectiveCamera(60, 1, 0.03, 500);
     this.isPerson = world.header.person !== null;
-    this.eyes = new (this.isPerson ? WalkingEyes : FlyingEyes)(this.renderer.domElement, start);
+    const floor = (x, y) => world.terrain.height(x, y);
+    this.eyes = new (this.isPerson ? WalkingEyes : FlyingEyes)(this.renderer.domElement, start, floor);
     const { mouth, gestures } = world.header;
     this.hand = this.isPerson
       ? new Hand(this.renderer.domElement, gestures, mouth, (cursor) => this.reach(cursor))
@@ -99,6 +100,7 @@ class Viewer {
       world.header.buttons,
       (side) => this.shears.toggle(side),
       () => this.indicate(this.wrist.after(this.intention)),
+      floor,
     );
     this.scene.add(this.headset.mark);
     this.wrist = new Wrist(this.headset.wrist, world.header.intentions);

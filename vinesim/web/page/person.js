@@ -34,9 +34,11 @@ export class Pace {
 
 /** Viewpoint of a walking person. */
 export class WalkingEyes extends FlyingEyes {
-  constructor(element, pose) {
+  /** `floor(x, y)` returns the height of the ground [m]. */
+  constructor(element, pose, floor) {
     super(element, pose);
-    this.height = pose[2];
+    this.floor = floor;
+    this.height = pose[2] - floor(pose[0], pose[1]);
     this.speed = WALK;
     this.crouch = 0;
     this.wish = [0, 0]; // m ahead and to the left that fingers have requested and the person has not walked yet
@@ -59,7 +61,7 @@ export class WalkingEyes extends FlyingEyes {
   update(seconds) {
     const goal = this.held.has("KeyQ") ? CROUCH : 0;
     this.crouch += Math.min(Math.max(goal - this.crouch, -1.5 * seconds), 1.5 * seconds);
-    this.place[2] = this.height - this.crouch;
+    this.place[2] = this.floor(this.place[0], this.place[1]) + this.height - this.crouch;
     this.speed = WALK;
     const share = Math.min(1, (WALK * seconds) / Math.max(Math.hypot(...this.wish), 1e-9));
     const [ahead, left] = this.wish;

@@ -333,9 +333,12 @@ precision highp float;
 uniform mat4 projectionMatrix;
 uniform mat4 modelViewMatrix;
 in vec3 position;
+in vec2 rise;
 out vec3 vPlace;
+out vec2 vRise;
 void main() {
   vPlace = position;
+  vRise = rise;
   gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0);
 }`;
 
@@ -344,9 +347,10 @@ export const GROUND_FRAGMENT =
   GROUND +
   /* glsl */ `
 in vec3 vPlace;
+in vec2 vRise;
 out vec4 pixel;
 void main() {
-  Surface s = soil(vPlace.xy);
+  Surface s = soil(vPlace.xy, vRise);
   pixel = vec4(display(leaving(s, s.normal, vPlace, false, false)), 1.0);
 }`;
 

@@ -14,6 +14,7 @@ import {
   SKY_FRAGMENT,
   SKY_VERTEX,
 } from "./shaders.js";
+import { Terrain } from "./terrain.js";
 
 const SHAPE_SHIFT = 10,
   SURFACE_SHIFT = 9,
@@ -94,6 +95,7 @@ export class World {
     this.coarser = 1;
     this.triangles = 0;
     this.budget = TRIANGLE_BUDGET;
+    this.terrain = new Terrain(header);
     this.makeMeshes(arrays);
     this.poses.needsUpdate = this.shapes.needsUpdate = this.surfaces.needsUpdate = true;
   }
@@ -265,7 +267,7 @@ export class World {
         rows: { value: new THREE.Vector2(...this.header.rows) },
       },
     });
-    const mesh = new THREE.Mesh(new THREE.PlaneGeometry(600, 600, 1, 1), material);
+    const mesh = new THREE.Mesh(this.terrain.geometry(), material);
     mesh.frustumCulled = false;
     return mesh;
   }
