@@ -113,7 +113,8 @@ def chain(vinebot: RobotDescription, base: str, tip: str) -> tuple[str, ...]:
     }
     found = []
     while tip != base:
-        tip, joint = above[tip]
+        parent, joint = above[tip]
+        tip = str(parent)
         found.append(joint)
     return tuple(joint for joint in reversed(found) if joint in vinebot.joints)
 

@@ -81,7 +81,7 @@ class Gnss:
         """Rate of the receiver [Hz]."""
         return self.spec.rate.value
 
-    def frame(self, _primitives: Primitives, snapshot: Snapshot, pose: np.ndarray, outputs: CameraOutput) -> GnssFix:
+    def frame(self, primitives: Primitives, snapshot: Snapshot, pose: np.ndarray, outputs: CameraOutput) -> GnssFix:
         """Measure as :class:`vinesim.sensors.sensor.Sensor` defines it; exactly if EXACT_DEPTH is wanted alone."""
         is_exact = CameraOutput.EXACT_DEPTH in outputs and CameraOutput.RGB not in outputs
         return self.measure(np.asarray(pose, float)[:3], snapshot.time, is_exact=is_exact)
