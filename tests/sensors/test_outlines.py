@@ -20,42 +20,55 @@ def _masks(count: int) -> list[np.ndarray]:
     return masks
 
 
-def _filled(polygons: list[list[int]], shape: tuple[int, int]) -> np.ndarray:
+def _filled(polygons: list[list[float]], shape: tuple[int, int]) -> np.ndarray:
     """As torchvision's references and DETR make a mask of a segmentation."""
     return coco_mask.decode(coco_mask.frPyObjects(polygons, *shape)).any(axis=2)
 
 
-def _area(polygon: list[int]) -> float:
+def _area(polygon: list[float]) -> float:
     x, y = np.array(polygon, float).reshape(-1, 2).T
     return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
 
 
 def test_polygons_are_the_mask() -> None:
-    for mask in _masks(150):
+    for mask in _masks(100):
         polygons = mask_polygons(mask)
         assert np.array_equal(_filled(polygons, mask.shape), mask)
         assert abs(sum(map(_area, polygons))) == mask.sum()  # so no two of them overlap, and holes count as negative
+        assert np.array_equal(_filled(mask_polygons(mask, inset=True), mask.shape), mask)
         parts = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)[0] - 1
         assert len(polygons) == parts
 
 
 def test_one_polygon_of_all_parts_is_the_mask() -> None:
-    for mask in _masks(80):
+    for mask in _masks(40):
         joined = join_polygons(mask_polygons(mask))
         assert np.array_equal(_filled([joined], mask.shape), mask)
         assert abs(_area(joined)) == mask.sum()
+        assert np.array_equal(_filled([join_polygons(mask_polygons(mask, inset=True))], mask.shape), mask)
+
+
+def _drawn(polygons: list[list[float]], shape: tuple[int, int]) -> np.ndarray:
+    """As Ultralytics makes a mask: corners are truncated, and the boundary is drawn."""
+    drawn = np.zeros(shape, np.uint8)
+    for polygon in polygons:
+        cv2.fillPoly(drawn, [np.array(polygon).astype(np.int32).reshape(-1, 1, 2)], 1)
+    return drawn.astype(bool)
+
+
+def test_inset_polygons_are_the_mask_also_where_corners_are_truncated_and_the_boundary_is_drawn() -> None:
+    for mask in _masks(80):
+        assert np.array_equal(_drawn(mask_polygons(mask, inset=True), mask.shape), mask)
 
 
 def test_fills_that_draw_the_boundary_are_larger_by_at_most_a_pixel() -> None:
-    """cv2.fillPoly, by which supervision and Ultralytics fill polygons, draws the pixels at corners too."""
+    """Polygons that are not inset, by cv2.fillPoly, as supervision makes a mask."""
     for mask in _masks(80):
-        drawn = np.zeros(mask.shape, np.uint8)
-        for polygon in mask_polygons(mask):
-            cv2.fillPoly(drawn, [np.array(polygon, np.int32).reshape(-1, 1, 2)], 1)
+        drawn = _drawn(mask_polygons(mask), mask.shape)
         padded = np.pad(mask, 1)
         grown = padded[1:-1, 1:-1] | padded[:-2, 1:-1] | padded[1:-1, :-2] | padded[:-2, :-2]
-        assert not (mask & ~drawn.astype(bool)).any()
-        assert not (drawn.astype(bool) & ~grown).any()
+        assert not (mask & ~drawn).any()
+        assert not (drawn & ~grown).any()
 
 
 @pytest.mark.parametrize(
