@@ -321,7 +321,7 @@ def test_semantic_images_have_the_classes_of_the_ids(
     dataset.prepare_folder(plan, tmp_path, IMAGES)
     list(dataset.render_images(plan, tmp_path, range(IMAGES)))
     assert dataset.missing_images(tmp_path, IMAGES) == []
-    names = json.loads((tmp_path / "dataset.json").read_text())["semantic"]
+    names = json.loads((tmp_path / "dataset.json").read_text())["classes"]
     organs_of = {
         "sky": Organ.NOTHING,
         "soil": Organ.GROUND,
@@ -348,6 +348,8 @@ def test_semantic_images_have_the_classes_of_the_ids(
     assert {name: _files(tmp_path)[name] for name in files} == files
     (tmp_path / "semantic" / "000002.png").unlink()
     assert dataset.missing_images(tmp_path, IMAGES) == [2]
+    with pytest.raises(DatasetError, match="begun with semantic True, not False"):
+        dataset.prepare_folder(DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE), tmp_path, IMAGES)
 
 
 def test_unknown_forms_are_refused_in_one_line(scene: pathlib.Path, tmp_path: pathlib.Path) -> None:

@@ -171,9 +171,11 @@ def yolo_labels(bunches: list[dict[str, Any]], width: int, height: int, task: st
         bunches: records of the picture's bunches.
         width: width of the picture [px].
         height: height of the picture [px].
-        task: one of :data:`YOLO_TASKS`. ``detect``: class 0, centre and size of the visible bounding box; ``segment``:
-            class 0 and one polygon of all visible parts, 0.05 px inside of them; ``pose``: as ``detect``, then the cut
-            point and 2 if it is visible, 1 if it is hidden, or three zeros if it is not in the picture.
+        task: one of :data:`YOLO_TASKS`.
+
+    A line for ``detect`` is class 0, centre and size of the visible bounding box; for ``segment`` class 0 and one
+    polygon of all visible parts, 0.05 px inside of them; for ``pose`` as for ``detect``, then the cut point and 2 if it
+    is visible, 1 if it is hidden, or three zeros if it is not in the picture.
     """
     size = np.array([width, height], float)
     lines = []

@@ -160,7 +160,8 @@ class DatasetPlan:
             "life": None if self.snapshot_source is None else self.snapshot_source.settings(),
             "sensors": {m.name: {"kind": m.kind} | msgspec.to_builtins(m) for m in self.sensors} or None,
             "negatives": self.negatives,
-            "semantic": dict(enumerate(formats.SEMANTIC_CLASSES)) if self.semantic else None,
+            "semantic": self.semantic,
+            "classes": dict(enumerate(formats.SEMANTIC_CLASSES)) if self.semantic else None,
         }
 
     def vineyard(self, number: int) -> Scene:
