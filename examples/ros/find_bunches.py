@@ -33,8 +33,9 @@ class BunchFinder(Node):
             rgb, depth, info = (self.parts[t] for t in ("rgb/image_raw", "depth/image_raw", "rgb/camera_info"))
             picture = np.frombuffer(rgb.data, np.uint8).reshape(rgb.height, rgb.width, 3)
             metres = np.frombuffer(depth.data, np.float32).reshape(depth.height, depth.width)
+            print(f"picture at {rgb.header.stamp.sec} s", flush=True)
             for x, y, z in find(picture, metres, np.reshape(info.k, (3, 3))):
-                print(f"{rgb.header.stamp.sec} s, {rgb.header.frame_id}: bunch at x {x:.2f} y {y:.2f} z {z:.2f} m", flush=True)
+                print(f"{rgb.header.frame_id}: bunch at x {x:.2f} y {y:.2f} z {z:.2f} m", flush=True)
 
 
 def find(picture: np.ndarray, metres: np.ndarray, k: np.ndarray) -> list[np.ndarray]:
