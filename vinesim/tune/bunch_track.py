@@ -106,9 +106,14 @@ def _centre(picture: CameraFrame, specimen: Specimen, clamp: np.ndarray) -> np.n
 def _opened(mask: np.ndarray, width: float) -> np.ndarray:
     """Returns the pixels of a mask without its parts that are thinner than ``width`` [pixel], holes filled."""
     reach = 0.5 * width
-    mask = ndimage.binary_fill_holes(mask)
-    kept = _depth_in(mask) > reach
+    kept = _depth_in(_filled(mask)) > reach
     return _depth_in(~kept) <= reach if kept.any() else kept
+
+
+def _filled(mask: np.ndarray) -> np.ndarray:
+    """Returns a mask with its holes filled."""
+    found: Any = ndimage.binary_fill_holes(mask)
+    return found
 
 
 def _depth_in(mask: np.ndarray) -> np.ndarray:
@@ -135,6 +140,6 @@ def _share_by_colour(rgb: np.ndarray, core: np.ndarray) -> np.ndarray:
     axis = np.linalg.solve(spread, step)
     share = ((rgb - wall.mean(0)) @ axis / (step @ axis)).clip(0.0, 1.0) * near
     share[inner] = 1.0
-    solid = ndimage.binary_fill_holes(share > 0.5)
+    solid = _filled(share > 0.5)
     share[solid & ndimage.binary_erosion(solid)] = 1.0
     return share * ndimage.binary_dilation(solid, iterations=1)
