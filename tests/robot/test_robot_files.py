@@ -25,7 +25,7 @@ from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.description.shown import shown_urdf
 from vinesim.robot.description.urdf import DescriptionError
-from vinesim.scene.values import CameraMount, LidarMount
+from vinesim.scene.values import CameraMount, GnssMount, LidarMount
 
 MOMENTS = 'ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"'
 
@@ -500,15 +500,20 @@ def test_sensors_are_those_of_gazebos_tags(tmp_path: pathlib.Path, caplog: pytes
 <gazebo reference="imu_link"><sensor name="imu" type="imu"><imu><angular_velocity><x><noise>
 <stddev>0.003</stddev></noise></x></angular_velocity></imu></sensor></gazebo>
 <gazebo reference="head_joint"><sensor name="neck" type="force_torque"/></gazebo>
-<gazebo reference="head"><sensor name="gps" type="navsat"/></gazebo>"""
+<gazebo reference="head"><sensor name="antenna" type="navsat"><update_rate>5</update_rate><navsat><position_sensing>
+<horizontal><noise type="gaussian"><stddev>0.4</stddev></noise></horizontal></position_sensing></navsat></sensor>
+</gazebo>
+<gazebo reference="head"><sensor name="ears" type="sonar"/></gazebo>"""
     fixed = "".join(
         f'<link name="{name}"/>{joint(name + "_joint", "base", name, "fixed")}'
         for name in ("head", "base_scan", "imu_link")
     )
     described = load_description(write(tmp_path / "a.urdf", robot(link("base"), fixed, tags)))
-    camera, lidar = described.sensors
+    camera, lidar, receiver = described.sensors
     assert isinstance(camera, CameraMount)
     assert isinstance(lidar, LidarMount)
+    assert isinstance(receiver, GnssMount)
+    assert (receiver.name, receiver.frame, receiver.rate, receiver.fix) == ("antenna", "head", 5.0, "float")
     assert (camera.name, camera.rate, camera.size, camera.field_of_view) == ("front", 12.0, (320, 200), 1.2)
     assert (camera.range, camera.noise) == ((0.05, 20.0), 0.01)
     assert (lidar.name, lidar.frame, lidar.rate, lidar.range, lidar.noise) == (
@@ -528,7 +533,7 @@ def test_sensors_are_those_of_gazebos_tags(tmp_path: pathlib.Path, caplog: pytes
     ahead = frames.rotate(pose[3:], np.array([0.0, 0.0, 1.0]))
     np.testing.assert_allclose(ahead, [math.cos(0.5), 0.0, -math.sin(0.5)], atol=1e-8)
     (warning,) = warnings_of(caplog)
-    assert "navsat" in warning
+    assert "sonar" in warning
 
 
 def test_sensors_of_links_without_tags_are_guessed(tmp_path: pathlib.Path) -> None:

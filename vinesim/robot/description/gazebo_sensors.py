@@ -14,12 +14,14 @@ from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has n
 from vinesim.core import frames
 from vinesim.robot.description.names import valid_names
 from vinesim.robot.description.urdf import parse_origin
-from vinesim.scene.values import CameraMount, ImuMount, LidarMount, RenderedMount, SensorMount
+from vinesim.scene.values import CameraMount, GnssMount, ImuMount, LidarMount, RenderedMount, SensorMount
 
 COLOR_CAMERAS = ("camera", "wideanglecamera", "wide_angle_camera", "multicamera")
 DEPTH_CAMERAS = ("depth", "depth_camera", "rgbd", "rgbd_camera")
 LIDARS = ("ray", "gpu_ray", "lidar", "gpu_lidar")
-"""Types of sensors in Gazebo that become lidars. ``COLOR_CAMERAS``, ``DEPTH_CAMERAS``: those that become cameras."""
+RECEIVERS = ("gps", "navsat")
+"""Types of sensors in Gazebo that become GNSS receivers. ``COLOR_CAMERAS``, ``DEPTH_CAMERAS``: those that become
+cameras; ``LIDARS``: lidars."""
 FRAME_TAGS = ("optical_frame_id", "gz_frame_id", "ignition_frame_id", "frame_name", "frameName")
 """Elements of a sensor or of its plugin that name the frame of its messages."""
 EXACT_CAMERA = "pinhole"
@@ -28,6 +30,11 @@ LIDAR = "vlp16"
 """Data file on which lidars of Gazebo are based, without its width of beams and losses."""
 OPTICAL = (-0.5 * math.pi, 0.0, -0.5 * math.pi)
 """[rad] Roll, pitch and yaw of an optical frame (z ahead, x right) in the frame of a camera (x ahead, z up)."""
+RECEIVER = "rtk"
+"""Data file on which GNSS receivers of Gazebo are based."""
+FIX_LIMITS = (0.1, 0.8)
+"""[m] Standard deviation of Gazebo's horizontal noise from which a receiver has float, and single, fixes. Receivers
+without noise have fixed ones. GUESSED: between the errors of the kinds in the data file."""
 MAX_LIDAR_RANGE = 200.0
 """[m] Largest range of a lidar; Gazebo's is often infinite."""
 MAX_CAMERA_RANGE = 300.0
@@ -39,7 +46,7 @@ MAX_BEAMS = 128
 def read_sensors(
     root: etree._Element, notes: list[str], assumed: list[str]
 ) -> tuple[list[RenderedMount], list[ImuMount], list[SensorMount]]:
-    """Returns cameras and lidars, inertial sensors, and force-torque sensors of a URDF.
+    """Returns cameras, lidars and GNSS receivers, inertial sensors, and force-torque sensors of a URDF.
 
     Adds the frames that they need to ``root``, the sensors that were found to ``notes``, and sensors that vinesim does
     not have to ``assumed``.
@@ -70,6 +77,8 @@ def read_sensors(
             rendered.append(_camera(root, name, frame, sensor))
         elif kind in LIDARS:
             rendered.append(_lidar(name, frame, sensor))
+        elif kind in RECEIVERS:
+            rendered.append(_receiver(name, frame, sensor))
         elif kind == "imu":
             imus.append(_imu(name, frame, sensor))
         elif kind == "force_torque":
@@ -81,7 +90,8 @@ def read_sensors(
         notes.append(f"sensors by Gazebo's tags: {', '.join(one.name for one in (*rendered, *imus, *wrenches))}")
     if unknown:
         more = f" (and {len(unknown) - 1} more)" if len(unknown) > 1 else ""
-        assumed.append(f"no sensor for {unknown[0]}{more}: vinesim has cameras, lidars, IMUs and force-torque sensors")
+        kinds = "cameras, lidars, GNSS receivers, IMUs and force-torque sensors"
+        assumed.append(f"no sensor for {unknown[0]}{more}: vinesim has {kinds}")
     return rendered, imus, wrenches
 
 
@@ -235,6 +245,14 @@ def _angles(ray: etree._Element, which: str, default: tuple[float, float], count
 
     samples = read("samples", count) * max(read("resolution", 1.0), 0.0)
     return read("min_angle", default[0]), read("max_angle", default[1]), max(int(samples), 1)
+
+
+def _receiver(name: str, frame: str, sensor: etree._Element) -> GnssMount:
+    paths = (f"{tag}/position_sensing/horizontal/noise/stddev" for tag in RECEIVERS)
+    noise = max(_number(sensor, path, 0.0) for path in paths)
+    low, high = FIX_LIMITS
+    fix = "fixed" if noise < low else "float" if noise < high else "single"
+    return GnssMount(name, frame, RECEIVER, rate=_rate(sensor, 10.0, 50.0), fix=fix)
 
 
 def _imu(name: str, frame: str, sensor: etree._Element) -> ImuMount:
