@@ -193,7 +193,11 @@ def test_a_reply_of_another_protocol_is_refused_with_both_versions():
 
 
 @pytest.mark.parametrize(
-    ("tokens", "words"), [([], "a Zenoh router, as of rmw_zenohd of ROS 2"), (["@ros2_lv/0/a/b"], "a ROS 2 graph")]
+    ("tokens", "words"),
+    [
+        ([], "a Zenoh router, such as rmw_zenohd of ROS 2"),
+        (["@ros2_lv/0/a/b"], "the router of a ROS 2 graph (rmw_zenohd)"),
+    ],
 )
 @pytest.mark.parametrize("is_live", [True, False])
 def test_a_router_of_another_program_is_no_server(tokens, words, is_live):

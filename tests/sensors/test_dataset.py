@@ -209,27 +209,6 @@ def test_masks_in_every_form_are_those_of_the_ids(copy: pathlib.Path, form: str)
         assert np.array_equal(pixels, ids == label(Organ.BUNCH, one["bunch"]))
 
 
-@pytest.mark.parametrize("form", annotations.SEGMENTATIONS)
-def test_supervision_reads_masks_of_every_form(copy: pathlib.Path, form: str) -> None:
-    """It fills polygons with their boundary, which adds up to a pixel to the right and below; run lengths are exact."""
-    supervision = pytest.importorskip("supervision", reason="supervision is no dependency of vinesim")
-    dataset.finish(copy, IMAGES, form)
-    read = supervision.DetectionDataset.from_coco(str(copy), str(copy / "annotations.json"), force_masks=True)
-    assert read.classes == ["bunch"]
-    annotated = json.loads((copy / "annotations.json").read_text())["annotations"]
-    assert len(read) == IMAGES
-    for path, _, found in read:
-        image = int(pathlib.Path(path).stem)
-        ids = _ids(copy / "ids" / f"{image:06d}.png")
-        bunches = [one["bunch"] for one in annotated if one["image_id"] == image]
-        assert found.class_id.tolist() == [0] * len(bunches)
-        for mask, bunch in zip(found.mask, bunches, strict=True):
-            truth = ids == label(Organ.BUNCH, bunch)
-            most = cv2.dilate(truth.astype(np.uint8), np.ones((2, 2)), anchor=(1, 1)).astype(bool)
-            assert not (truth & ~mask).any()
-            assert not (mask & ~(most if form == "polygons" else truth)).any()
-
-
 def test_coco_file_names_version_seed_and_licence_but_no_date(whole: pathlib.Path, copy: pathlib.Path) -> None:
     said = json.loads((copy / "annotations.json").read_text())
     assert said["info"]["version"] == __version__
