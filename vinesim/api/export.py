@@ -30,7 +30,9 @@ def export_vineyard(source: Source, file: str | os.PathLike[str], *, leaves: boo
     path = check_file(file)
     if isinstance(source, (str, pathlib.Path)):
         source = load_scene(source)
-    name, parameters = "vineyard", PhysicsParameters()
+    name = "vineyard"
+    parameters = PhysicsParameters()
     if isinstance(source, Scene):
-        name, parameters = source.name, source.physics
+        name = source.name
+        parameters = source.physics
     write_vineyard(model_of(source), path, name=name, leaves=leaves, parameters=parameters)

@@ -8,6 +8,7 @@ print(bag.damage)
 
 from __future__ import annotations
 
+import abc
 import contextlib
 import pathlib
 import re
@@ -155,7 +156,7 @@ def _open(file: pathlib.Path, is_packed: bool) -> _File:
     raise BagError(f"{file}: is {kind}; give a recording of ROS topics ('vinesim ros record' or 'ros2 bag record')")
 
 
-class _File:
+class _File(abc.ABC):
     """One file of a recording."""
 
     def __init__(self, path: pathlib.Path, stream: IO[bytes], is_packed: bool) -> None:
@@ -180,8 +181,9 @@ class _File:
         except Exception as bad:  # damaged bytes can raise anything while they are decoded
             self.damage = self.damage or f"{self.path}: is damaged after message {count} ({_reason(bad)})"
 
+    @abc.abstractmethod
     def read(self, topics: Collection[str] | None) -> Iterator[BagMessage]:
-        raise NotImplementedError
+        """Yield the messages of some topics, or of all, as they are in the file. Damaged bytes may raise anything."""
 
 
 class _McapFile(_File):

@@ -144,7 +144,8 @@ class _Conversion:
             link = name if is_last else f"{joint}_link"
             part = Part(link, pose, parent, joint, kind, anchor, axis, limit, mimic)
             if not is_last:  # a link between two joints of one body, which needs a mass in physics
-                part.mass, part.centre = BETWEEN_MASS, frames.pose(anchor)
+                part.mass = BETWEEN_MASS
+                part.centre = frames.pose(anchor)
                 part.inertia = np.eye(3) * BETWEEN_MASS * BETWEEN_RADIUS**2
             self.parts.append(part)
             parent = link

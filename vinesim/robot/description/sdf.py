@@ -193,7 +193,9 @@ class _Conversion:
         if part.parent is not None:
             self.notes.append(f"joint {name!r} closes a loop of the mechanism, and is left out")
             return []
-        part.parent, part.joint, part.kind = parent, name, KINDS.get(kind, "fixed")
+        part.parent = parent
+        part.joint = name
+        part.kind = KINDS.get(kind, "fixed")
         if kind not in KINDS:
             self.notes.append(f"joint {name!r} of the type {kind!r} is fixed")
         place = self._place(name)

@@ -60,7 +60,9 @@ def message(fix: GnssFix) -> NavSatFix:
     told = NavSatFix(header=convert.header(fix.time, fix.frame_id))
     told.status.status = _STATUS[fix.kind]
     told.status.service = _SERVICES
-    told.latitude, told.longitude, told.altitude = fix.latitude, fix.longitude, fix.altitude
+    told.latitude = fix.latitude
+    told.longitude = fix.longitude
+    told.altitude = fix.altitude
     if fix.kind is not FixKind.NONE:
         told.position_covariance = np.diag(fix.variance).ravel()
         told.position_covariance_type = NavSatFix.COVARIANCE_TYPE_DIAGONAL_KNOWN
