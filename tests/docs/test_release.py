@@ -120,7 +120,7 @@ def test_pip_adds_an_extra_to_an_installed_vinesim_without_looking_for_vinesim()
 PACKAGES = {"nodejs", "npm", "g++", "python3-venv", "python3-dev"}
 """Packages of Debian and Ubuntu that container files install."""
 CONTAINER_FILES = {"Dockerfile": r"python:3\.1[123]-slim-bookworm( AS \w+)?", "ros/install/Dockerfile": r"\$\{ROS\}"}
-"""Container files, with a pattern of what they build upon."""
+"""Container files, and for each a pattern of its base image."""
 
 
 def instructions(file: str) -> list[tuple[str, str]]:

@@ -201,7 +201,7 @@ def test_a_reply_of_another_protocol_is_refused_with_both_versions():
 )
 @pytest.mark.parametrize("is_live", [True, False])
 def test_a_router_of_another_program_is_no_server(tokens, words, is_live):
-    """A client, or a recorder, at the router of rmw_zenoh is told what is there; its own router routes other keys."""
+    """A client or a recorder that connects to a router of rmw_zenoh fails with one line that names this router."""
     (endpoint,) = resolve_ports(["tcp/127.0.0.1:0"])
     router = open_session(config("router", listen__endpoints=[endpoint.locator]))
     declared = [router.liveliness().declare_token(token) for token in tokens]

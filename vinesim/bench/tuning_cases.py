@@ -32,20 +32,20 @@ class Case:
     experiment: Experiment
 
 
+def _number(value: float, unit: str) -> Number:
+    return Number(value, unit, "GUESSED", "benchmark")
+
+
 def bench_cane(modulus: float, damping: float, segments: int = 8) -> Specimen:
     """Returns the cane of this benchmark; ``modulus`` [Pa], ``damping`` [s], ``segments``: number of rigid bodies."""
-
-    def number(value: float, unit: str) -> Number:
-        return Number(value, unit, "GUESSED", "benchmark")
-
     return Specimen(
         organ="cane",
-        length=number(1.0, "m"),
-        base_diameter=number(0.009, "m"),
-        tip_diameter=number(0.006, "m"),
-        modulus=number(modulus, "Pa"),
-        density=number(900.0, "kg/m^3"),
-        damping=number(damping, "s"),
+        length=_number(1.0, "m"),
+        base_diameter=_number(0.009, "m"),
+        tip_diameter=_number(0.006, "m"),
+        modulus=_number(modulus, "Pa"),
+        density=_number(900.0, "kg/m^3"),
+        damping=_number(damping, "s"),
         segments=segments,
     )
 
@@ -63,19 +63,15 @@ def draw_case(seed: int) -> Case:
 
 def bench_bunch(modulus: float, damping: float) -> Specimen:
     """Returns the bunch of this benchmark; ``modulus`` [Pa], ``damping`` [s]."""
-
-    def number(value: float, unit: str) -> Number:
-        return Number(value, unit, "GUESSED", "benchmark")
-
     return Specimen(
         organ="bunch",
-        length=number(0.08, "m"),
-        base_diameter=number(0.0045, "m"),
-        tip_diameter=number(0.0045, "m"),
-        modulus=number(modulus, "Pa"),
-        density=number(1000.0, "kg/m^3"),
-        damping=number(damping, "s"),
-        tip_mass=number(0.5, "kg"),
+        length=_number(0.08, "m"),
+        base_diameter=_number(0.0045, "m"),
+        tip_diameter=_number(0.0045, "m"),
+        modulus=_number(modulus, "Pa"),
+        density=_number(1000.0, "kg/m^3"),
+        damping=_number(damping, "s"),
+        tip_mass=_number(0.5, "kg"),
         segments=4,
     )
 

@@ -111,7 +111,8 @@ def draw(
     info = CameraInfo(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), "optical")
     start, middle = _fitting_view(shape.points, info)
     if target is not None:
-        start, middle = start + target - middle, target
+        start = start + target - middle
+        middle = target
     pose = look_at(start if eye is None else eye, middle)
     return _draw_mesh(shape, info, pose) if shape.triangles.size else _draw_points(shape, info, pose)
 
