@@ -71,8 +71,10 @@ def test_the_segment_of_a_real_node_is_held_while_it_lives_and_removed_after_a_k
     try:
         assert owner.stdout is not None
         owner.stdout.readline()
-        mapped = {line.split()[-1] for line in pathlib.Path(f"/proc/{owner.pid}/maps").read_text().splitlines()}
-        mine = [path for path in FOLDER.glob("fast*_*") if str(path) in mapped and path.stat().st_size >= SMALLEST]
+        # the node also maps the segments of its peers, but opens the lock files of its own only
+        opened = [os.readlink(file) for file in pathlib.Path(f"/proc/{owner.pid}/fd").iterdir()]
+        locked = [pathlib.Path(name[:-3]) for name in opened if name.startswith(str(FOLDER)) and name.endswith("_el")]
+        mine = [path for path in locked if path.exists() and path.stat().st_size >= SMALLEST]
         assert mine
         remove_dead_segments()
         assert all(path.exists() for path in mine)
