@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import logging
 import os
 import shutil
 import subprocess
@@ -11,8 +10,9 @@ import sys
 
 import pytest
 
+from tests.support.progress_texts import collect_progress
 from tests.support.waiting import deadline
-from vinesim.core import disk_cache, progress
+from vinesim.core import disk_cache
 from vinesim.ros import middleware
 from vinesim.ros.messages import message_packages
 
@@ -129,16 +129,14 @@ def test_a_changed_definition_changes_the_key(tmp_path, monkeypatch):
     assert message_packages.key("tf2_msgs") != before
 
 
-def test_a_build_shows_how_many_packages_are_done(tmp_path, monkeypatch, caplog):
+def test_a_build_shows_how_many_packages_are_done(tmp_path, monkeypatch):
     names = message_packages.available_packages()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(progress, "PERIOD", 0.0)
-    monkeypatch.setattr(progress.log, "propagate", True)
+    texts = collect_progress(monkeypatch)
     monkeypatch.setattr(message_packages, "_build", lambda _: tmp_path)
-    with caplog.at_level(logging.INFO, "vinesim.core.progress"):
-        message_packages.build(names)
+    message_packages.build(names)
     count = len(names)
-    assert f"building ROS message packages, only once: {count} of {count} done" in caplog.messages
+    assert f"building ROS message packages, only once: {count} of {count} done" in texts
 
 
 @pytest.mark.long

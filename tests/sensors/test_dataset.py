@@ -3,7 +3,6 @@
 import contextlib
 import errno
 import json
-import logging
 import os
 import pathlib
 import resource
@@ -22,13 +21,13 @@ from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
 from tests.support import programs
+from tests.support.progress_texts import collect_progress
 from tests.support.waiting import deadline
 from vinesim.cli.dataset import _progress
 from vinesim.cli.dataset import run as run_dataset
 from vinesim.cli.render import run as render
 from vinesim.client.composition.domain_randomizer import SceneRandomizer
 from vinesim.client.composition.scene_composer import PlacementError
-from vinesim.core import progress
 from vinesim.core.data_files import DataFileNotFound
 from vinesim.core.errors import UsageError, WriteError
 from vinesim.core.version import __version__
@@ -118,13 +117,12 @@ def test_stopped_killed_and_gone_on_with_it_is_the_same_data_set(
     assert _files(out) == _files(whole)
 
 
-def test_progress_in_a_log_file_is_a_line_every_few_seconds(monkeypatch, caplog, capsys) -> None:
-    monkeypatch.setattr(progress, "PERIOD", 0.0)
-    monkeypatch.setattr(progress.log, "propagate", True)
-    with caplog.at_level(logging.INFO, "vinesim.core.progress"), _progress(20, 5) as advance:
+def test_progress_in_a_log_file_is_a_line_every_few_seconds(monkeypatch, capsys) -> None:
+    texts = collect_progress(monkeypatch)
+    with _progress(20, 5) as advance:
         advance(1)
         advance(2)
-    assert caplog.messages == ["6 of 20 images are there", "8 of 20 images are there", ""]
+    assert texts == ["6 of 20 images are there", "8 of 20 images are there", ""]
     assert capsys.readouterr().out == ""
 
 
