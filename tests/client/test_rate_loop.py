@@ -5,7 +5,7 @@ import pytest
 
 from tests.support.waiting import wait
 from vinesim.client import rate_loop as module
-from vinesim.client.pace import Limit, OwnPace, RealTime
+from vinesim.client.pace import LONGEST_GAP, Limit, OwnPace, RealTime
 from vinesim.client.rate_loop import RateLoop
 
 
@@ -138,6 +138,18 @@ def test_a_client_alone_on_a_slow_machine_slows_its_time_and_skips_nothing(clock
     assert loop.target_factor == pytest.approx(0.36, abs=0.01)
     assert np.diff(starts) == pytest.approx(0.01 / loop.target_factor, abs=0.002)
     assert loop.clock.cause == "picker: steps"
+
+
+@pytest.mark.parametrize("stall", [0.4, 2.5, 600.0])
+def test_a_client_alone_stops_its_time_while_it_is_stalled_and_skips_nothing(clock, stall):
+    """Nobody else follows its time. After the stall it is late by a quarter of a second at most."""
+    loop = own_pace(clock)
+    run(loop, clock, [0.002] * 100)
+    since = loop.next_time
+    run(loop, clock, [stall, *[0.002] * 99])
+    assert loop.dropped == 0
+    assert loop.next_time - since == pytest.approx(1.0)
+    assert loop.clock.time(clock.now) - loop.next_time < LONGEST_GAP
 
 
 def test_its_time_rises_again_slowly_and_does_not_swing(clock):

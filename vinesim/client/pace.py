@@ -19,6 +19,8 @@ HELD_SHARE = 0.1
 speed as its limit."""
 REPORT_PERIOD = 0.05
 """Real time between two reports of speed to :class:`OwnPace`, the clock of a client without a server [s]."""
+LONGEST_GAP = 0.25
+"""Longest real time between two calls of :meth:`OwnPace.keep` that the clock counts [s]."""
 
 
 class StepClock(Protocol):
@@ -66,13 +68,20 @@ class RealTime:
 
 class OwnPace:
     """The clock of a client without a server. Its time passes as fast as this client can compute, at most in real
-    time."""
+    time.
+
+    The clock stops while the client is stalled, because nobody else follows it. So the client skips no steps.
+    """
 
     def __init__(self, name: str, now: float, report: Callable[[], PaceReport]) -> None:
         self._name = name
         self._report = report
         self._clock = WorldClock(now)
         self._next_report = now
+        self._kept = now
+        """Real time of the last call of :meth:`keep` [s]."""
+        self._stalled = 0.0
+        """Real time that the clock has not counted [s]."""
 
     @property
     def factor(self) -> float:
@@ -83,16 +92,23 @@ class OwnPace:
         return self._clock.cause
 
     def time(self, now: float) -> float:
-        return self._clock.time(now)
+        return self._clock.time(self._counted(now))
 
     def is_current(self, now: float) -> bool:
         return True
 
     def keep(self, now: float) -> None:
-        self._clock.advance(now)
+        counted = self._counted(now)
+        self._stalled = now - counted
+        self._kept = now
+        self._clock.advance(counted)
         if now >= self._next_report:
             self._next_report = now + REPORT_PERIOD
-            self._clock.report(self._name, now, self._report())
+            self._clock.report(self._name, counted, self._report())
+
+    def _counted(self, now: float) -> float:
+        """Returns ``now`` [s] without the time for which the client was stalled."""
+        return min(now, self._kept + LONGEST_GAP) - self._stalled
 
 
 class WorldPace:
