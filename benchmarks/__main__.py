@@ -149,6 +149,16 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
         "train a detector on synthetic pictures and on photographs, and test both on photographs (GPU)",
         TRANSFER_OPTIONS,
     ),
+    "picture_statistics": (
+        _later("picture_statistics:picture_statistics"),
+        "colours, noise and shapes in synthetic pictures beside those in photographs",
+        {
+            "photos": {"required": True, "help": "folder of photographs with masks"},
+            "synthetic": {"action": "append", "required": True, "help": "folder of `vinesim dataset`; may be repeated"},
+            "limit": {"type": int, "help": "read at most this number of pictures of each synthetic folder"},
+            "out": {"help": "file for the table in Markdown"},
+        },
+    ),
     "soak": (
         _soak,
         "memory, threads and open files in a long run (Linux)",
