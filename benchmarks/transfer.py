@@ -170,8 +170,8 @@ def rows(
     if packed:
         pictures = bunch_pictures.read_packs([pathlib.Path(file) for file in packed])
     else:
-        folders = [[pathlib.Path(folder) for folder in some] for some in (photos, synthetic)]
-        pictures = bunch_pictures.read_folders(*folders, limit, _announce)
+        places = map(pathlib.Path, photos), map(pathlib.Path, synthetic)
+        pictures = bunch_pictures.read_folders(*places, limit, _announce)
     if pack is not None:
         bunch_pictures.write_pack(pictures, pathlib.Path(pack), quality)
         _announce(f"{pack}: {pathlib.Path(pack).stat().st_size / 2**20:.1f} MiB")
@@ -226,7 +226,7 @@ def default_sets(pictures: Collection, learnt: Sequence[BunchPicture]) -> list[s
 def training_set(text: str, synthetic: dict[str, list[BunchPicture]], learnt: Sequence[BunchPicture]) -> TrainingSet:
     """Returns the training set that ``text`` names, such as ``vsp:50+real:5``."""
     for name in (REAL, ALL):
-        if name in synthetic and name != next(iter(synthetic)):
+        if name in synthetic and (name == REAL or len(synthetic) > 1):
             raise UsageError(f"a synthetic folder is named {name!r}, which stands for other pictures; rename it")
     parts = []
     for word in text.split("+"):

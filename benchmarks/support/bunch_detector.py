@@ -130,7 +130,7 @@ def change_colours(pictures: Tensor, rng: np.random.Generator, noise: torch.Gene
     blur and noise. ``noise`` draws the noise, on the pictures' device."""
     count, device = len(pictures), pictures.device
 
-    def each(values: np.ndarray) -> Tensor:
+    def each(values: np.ndarray) -> Tensor:  # to be multiplied with the pictures
         return torch.tensor(values, dtype=torch.float32, device=device).reshape(count, -1, 1, 1)
 
     matrices = torch.tensor(np.array([colour_matrix(rng) for _ in range(count)]), dtype=torch.float32, device=device)
