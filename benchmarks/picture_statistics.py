@@ -55,7 +55,7 @@ def picture_statistics(
         require_place("--out", out)
     places = [pathlib.Path(folder) for folder in synthetic]
     folders = bunch_pictures.read_folders(
-        [pathlib.Path(photos)], places, limit, lambda line: print(line, file=sys.stderr, flush=True)
+        [pathlib.Path(photos)], places, limit, announce=lambda line: print(line, file=sys.stderr, flush=True)
     )
     ((name, photographs),) = folders.photographs.items()
     masked = [p for p in photographs if p.bunches is not None]

@@ -11,6 +11,8 @@ A computer with a GPU that has PyTorch, numpy, SciPy and Pillow, but not vinesim
     python -m benchmarks transfer --photos FOLDER --synthetic FOLDER --pack pictures.zip    # here
     python3 -m benchmarks.transfer --packed pictures.zip --out RESULT                       # there, in a checkout
 
+Several packs are read together, so ``--limit`` and ``--skip`` divide a large data set into packs of a given size.
+
 Photographs have the layout of WGISD (:func:`benchmarks.support.bunch_pictures.read_photographs`). Those of the first
 folder that have masks are divided: a third to learn from and the rest to test on, each with equal shares of all
 varieties, by a fixed seed. All others are only tested on.
@@ -58,6 +60,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "photos": {"action": "append", "default": [], "help": "folder of photographs with masks; more: only to test on"},
     "synthetic": {"action": "append", "default": [], "help": "folder of `vinesim dataset`; may be repeated"},
     "limit": {"type": int, "help": "read at most this number of pictures of each synthetic folder"},
+    "skip": {"type": int, "default": 0, "help": "leave out this number of pictures of each synthetic folder"},
     "pack": {"help": "write all pictures into this file, and end"},
     "quality": {"type": int, "default": 90, "help": "JPEG quality of pictures in a pack"},
     "packed": {"action": "append", "default": [], "help": "read the pictures from this file; may be repeated"},
@@ -138,6 +141,7 @@ def rows(
     photos: Sequence[str] = (),
     synthetic: Sequence[str] = (),
     limit: int | None = None,
+    skip: int = 0,
     pack: str | None = None,
     quality: int = 90,
     packed: Sequence[str] = (),
@@ -157,8 +161,9 @@ def rows(
     for option, value in least.items():
         if value is not None and value < 1:
             raise UsageError(f"--{option} is {value}: give 1 or more")
-    if seed < 0:
-        raise UsageError(f"--seed is {seed}: give 0 or more")
+    for option, value in (("seed", seed), ("skip", skip)):
+        if value < 0:
+            raise UsageError(f"--{option} is {value}: give 0 or more")
     if crop < 32 or crop % 32:
         raise UsageError(f"--crop is {crop}: give a multiple of 32")
     if not 1 <= quality <= 95:
@@ -171,7 +176,7 @@ def rows(
         pictures = bunch_pictures.read_packs([pathlib.Path(file) for file in packed])
     else:
         places = map(pathlib.Path, photos), map(pathlib.Path, synthetic)
-        pictures = bunch_pictures.read_folders(*places, limit, _announce)
+        pictures = bunch_pictures.read_folders(*places, limit, skip, _announce)
     if pack is not None:
         bunch_pictures.write_pack(pictures, pathlib.Path(pack), quality)
         _announce(f"{pack}: {pathlib.Path(pack).stat().st_size / 2**20:.1f} MiB")

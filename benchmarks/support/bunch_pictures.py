@@ -62,16 +62,18 @@ def read_photographs(folder: pathlib.Path) -> list[BunchPicture]:
     return [_read_photograph(file) for file in files]
 
 
-def read_dataset(folder: pathlib.Path, limit: int | None = None) -> list[BunchPicture]:
-    """Returns the pictures of a folder of ``vinesim dataset``, at most the first ``limit`` of them.
+def read_dataset(folder: pathlib.Path, limit: int | None = None, skip: int = 0) -> list[BunchPicture]:
+    """Returns the pictures of a folder of ``vinesim dataset`` without the first ``skip``, at most ``limit``.
 
     Raises :class:`UsageError` for a folder that holds none, or with a file that cannot be read.
     """
     files = sorted((folder / "images").glob("*")) if folder.is_dir() else []
     if not files:
         raise UsageError(f"--synthetic {folder} holds no pictures; give a folder that `vinesim dataset` has written")
+    if skip >= len(files):
+        raise UsageError(f"--skip is {skip}, but --synthetic {folder} holds {len(files)} pictures; skip fewer")
     pictures = []
-    for file in files[:limit]:
+    for file in files[skip : None if limit is None else skip + limit]:
         ids = folder / "ids" / f"{file.stem}.png"
         if not ids.is_file():
             raise UsageError(f"--synthetic {folder}: {ids} is missing; run `vinesim dataset` again to complete it")
@@ -201,16 +203,18 @@ def read_folders(
     photos: Iterable[pathlib.Path],
     synthetic: Iterable[pathlib.Path],
     limit: int | None = None,
+    skip: int = 0,
     announce: Callable[[str], None] = lambda _: None,
 ) -> Collection:
-    """Returns the pictures of folders of photographs and of data sets, of each data set at most the first ``limit``."""
+    """Returns the pictures of folders of photographs and of data sets; ``limit``, ``skip``: see
+    :func:`read_dataset`."""
     collection = Collection()
     for folder in photos:
         announce(f"reading {folder}")
         _add(collection.photographs, "--photos", folder, read_photographs(folder))
     for folder in synthetic:
         announce(f"reading {folder}")
-        _add(collection.synthetic, "--synthetic", folder, read_dataset(folder, limit))
+        _add(collection.synthetic, "--synthetic", folder, read_dataset(folder, limit, skip))
     return collection
 
 

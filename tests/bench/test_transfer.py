@@ -104,6 +104,9 @@ def test_the_bunches_of_a_data_set_are_those_of_its_labels(tmp_path):
     pictures = bunch_pictures.read_dataset(tmp_path, 2)
     assert [p.name for p in pictures] == ["000000", "000001"]
     np.testing.assert_array_equal(pictures[1].bunches, two_bunches())
+    assert [p.name for p in bunch_pictures.read_dataset(tmp_path, 5, skip=1)] == ["000001", "000002"]
+    with pytest.raises(UsageError, match=r"--skip is 3, but .* holds 3 pictures; skip fewer"):
+        bunch_pictures.read_dataset(tmp_path, skip=3)
     (tmp_path / "ids/000001.png").unlink()
     with pytest.raises(UsageError, match="run `vinesim dataset` again"):
         bunch_pictures.read_dataset(tmp_path)
