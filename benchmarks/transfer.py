@@ -306,7 +306,7 @@ def _compare(
                 found.append(row)
                 if out is not None:
                     _write(out, record, found)
-                    sheet = re.sub(r"[^\w+-]", "_", f"{one.name}-{name}-{seed}")
+                    sheet = re.sub(r"[^\w-]", "_", f"{one.name}-{name}-{seed}")
                     with writing(out):
                         contact_sheet(photographs, answers).save(out / f"{sheet}.jpg", quality=80)
                 yield row
