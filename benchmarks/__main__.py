@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from benchmarks.transfer import OPTIONS as TRANSFER_OPTIONS
 from vinesim.cli.bench import print_measurement
 from vinesim.core.errors import UsageError
 from vinesim.scene.values import Measurement
@@ -143,6 +144,21 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
         "load, stand and visibility of all robot files below folders",
         {"folders": {"nargs": "+", "metavar": "FOLDER", "help": "folder with robot files, or one file"}},
     ),
+    "transfer": (
+        _later("transfer:transfer"),
+        "train a detector on synthetic pictures and on photographs, and test both on photographs (GPU)",
+        TRANSFER_OPTIONS,
+    ),
+    "picture_statistics": (
+        _later("picture_statistics:picture_statistics"),
+        "colours, noise and shapes in synthetic pictures beside those in photographs",
+        {
+            "photos": {"required": True, "help": "folder of photographs with masks"},
+            "synthetic": {"action": "append", "required": True, "help": "folder of `vinesim dataset`; may be repeated"},
+            "limit": {"type": int, "help": "read at most this number of pictures of each synthetic folder"},
+            "out": {"help": "file for the table in Markdown"},
+        },
+    ),
     "soak": (
         _soak,
         "memory, threads and open files in a long run (Linux)",
@@ -181,6 +197,11 @@ def main(words: list[str] | None = None) -> int:
     except UsageError as error:
         print(f"benchmarks: {error}", file=sys.stderr)
         return 2
+    except RuntimeError as error:
+        if (code := getattr(error, "exit_code", None)) is None:
+            raise
+        print(f"benchmarks: {error}", file=sys.stderr)
+        return code
     except KeyboardInterrupt:
         return 130
     return 0
