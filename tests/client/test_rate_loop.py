@@ -30,7 +30,7 @@ def clock(monkeypatch):
 
 
 def own_pace(clock):
-    loop = RateLoop(0.01, max_lag=1.0)
+    loop = RateLoop(0.01, max_lag=np.inf)
     loop.clock = OwnPace("picker", clock.now, loop.report)
     return loop
 
@@ -150,6 +150,16 @@ def test_a_client_alone_stops_its_time_while_it_is_stalled_and_skips_nothing(clo
     assert loop.dropped == 0
     assert loop.next_time - since == pytest.approx(1.0)
     assert loop.clock.time(clock.now) - loop.next_time < LONGEST_GAP
+
+
+def test_a_client_alone_that_makes_a_step_in_five_seconds_skips_nothing(clock):
+    """The clock goes at a hundredth of real time at least, five times as fast as this client."""
+    loop = own_pace(clock)
+    run(loop, clock, [0.002])
+    since = loop.next_time
+    run(loop, clock, [5.0] * 300)
+    assert loop.dropped == 0
+    assert loop.next_time - since == pytest.approx(3.0)
 
 
 def test_its_time_rises_again_slowly_and_does_not_swing(clock):

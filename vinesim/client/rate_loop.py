@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 import pathlib
 import time
 from collections.abc import Callable
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 WAITING_MAX_LAG = 1.0
-"""Largest lag behind a clock that waits for slow clients [s]. A loop that is further behind skips steps."""
+"""Largest lag behind the clock of a server, which waits for slow clients [s]. A loop that is further behind skips
+steps."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -267,7 +269,7 @@ def paced_loop(client: Client, *, is_shared: bool, factor: float | None = None) 
     elif factor is not None:
         loop = RateLoop(client.physics.dt, RealTime(factor))
     else:
-        loop = RateLoop(client.physics.dt, max_lag=WAITING_MAX_LAG)
+        loop = RateLoop(client.physics.dt, max_lag=math.inf)  # the clock stops when the client does
         loop.clock = OwnPace(client.name, time.monotonic(), loop.report)
     client.pace_text = lambda: describe(loop.clock.factor, loop.clock.cause)
     loop.meter.limits += client.pace_limits
