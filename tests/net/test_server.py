@@ -216,30 +216,36 @@ def test_a_router_of_another_program_is_no_server(tokens, words, is_live):
     close_session(router)
 
 
-def test_a_linked_server_says_that_no_server_answers_and_goes_on_trying(caplog):
-    """At a router of another program or a port where nobody listens, there is one line; a server that appears is
-    found."""
+def watched(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records if "main_server_watch" in record.name]
+
+
+def test_a_linked_server_says_that_no_server_answers_and_finds_the_one_that_appears(caplog):
     (endpoint,) = resolve_ports(["tcp/127.0.0.1:0"])
+    with contextlib.ExitStack() as stack:
+        linked = Server("tcp/127.0.0.1:0", connect=[str(endpoint)])
+        wait(lambda: linked.figures()["trouble"], "the server to report a port where nobody listens")
+        stack.enter_context(Server(str(endpoint)))
+        stack.enter_context(linked)  # it ends first
+        wait(lambda: not linked.figures()["trouble"], "the server that keeps the world")
+    missing, found = watched(caplog)
+    assert missing.startswith(f"no vinesim server answers at {endpoint} within 4 s (no connection): start one with")
+    assert missing.endswith("this server goes on trying")
+    assert "\n" not in missing
+    assert str(endpoint) in found
+
+
+def test_a_linked_server_says_that_a_router_of_another_program_is_no_server(caplog):
+    (endpoint,) = resolve_ports(["tcp/127.0.0.1:0"])
+    router = open_session(config("router", listen__endpoints=[endpoint.locator]))
     with Server("tcp/127.0.0.1:0", connect=[str(endpoint)]) as linked:
-
-        def says(words: str) -> bool:
-            trouble = linked.figures()["trouble"]
-            return words in trouble if words else not trouble
-
-        wait(lambda: says("no vinesim server answers at"), "the server to report a port without a router")
-        with Server(str(endpoint)):
-            wait(lambda: says(""), "the server that keeps the world")
-            with ZenohBus("ada", connect=linked.endpoint) as ada:
-                ada.join(hello("ada"))
-        router = open_session(config("router", listen__endpoints=[endpoint.locator]))
-        wait(lambda: says("no vinesim server there"), "the server to report a router of another program")
-        close_session(router)
-        lines = [record.getMessage() for record in caplog.records if "main_server_watch" in record.name]
-        assert [str(endpoint) in line and "\n" not in line for line in lines] == 3 * [True]
-        assert [line.endswith("this server goes on trying") for line in lines] == [True, False, True]
-        assert "a Zenoh router" in lines[2]
-        with Server(str(endpoint)):
-            wait(lambda: says(""), "the server that keeps the world")
+        wait(lambda: linked.figures()["trouble"], "the server to report the router")
+        (line,) = watched(caplog)
+        assert linked.figures()["trouble"] == line
+    close_session(router)
+    assert line.startswith(f"no vinesim server there: at {endpoint} is a Zenoh router")
+    assert line.endswith("this server goes on trying")
+    assert "\n" not in line
 
 
 def test_the_default_port_is_none_of_zenoh_or_dds():

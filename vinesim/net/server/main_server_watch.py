@@ -1,4 +1,4 @@
-"""Tells the users of a server that only routes whether the server that keeps the world answers through its links."""
+"""Tells the users of a server that only routes whether a server answers at its links."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import zenoh
 
 from vinesim.net.transport.endpoints import Endpoint
 from vinesim.net.transport.zenoh_admission import ROS_TOKENS
-from vinesim.net.transport.zenoh_session import CONNECT_TIMEOUT, NoServer, ServerUnreachable, has_match
+from vinesim.net.transport.zenoh_session import CONNECT_TIMEOUT, NoServer, ServerUnreachable
 
 log = logging.getLogger(__name__)
 
-WATCH_PERIOD = 0.2
+WATCH_PERIOD = 0.5
 """Time between two checks [s]."""
 
 PATIENCE = 2.0 * CONNECT_TIMEOUT
@@ -23,24 +23,22 @@ PATIENCE = 2.0 * CONNECT_TIMEOUT
 class MainServerWatch:
     """Reports once that no server answers, and once that it answers again."""
 
-    def __init__(self, connect: Sequence[Endpoint]) -> None:
-        """``connect``: endpoints to which the server is linked."""
+    def __init__(self, connect: Sequence[Endpoint], key: str) -> None:
+        """``connect``: endpoints to which the server is linked. ``key``: key under which servers answer."""
         self._connect = connect
-        self._querier: zenoh.Querier | None = None
-        self._session: zenoh.Session | None = None
+        self._key = key
         self._missing_since: float | None = None
         self.trouble = ""
         """What is reported now; empty while a server answers."""
 
-    def check(self, session: zenoh.Session, root: str, now: float) -> None:
-        """Look for a server that admits actors to the worlds of the key expression ``root``, at the time ``now`` [s].
+    def check(self, session: zenoh.Session, now: float) -> None:
+        """Ask at the time ``now`` [s] whether another server than that of ``session`` answers.
 
         Raises :class:`zenoh.ZError` if the session was closed meanwhile.
         """
-        if session is not self._session or self._querier is None:
-            self._session = session
-            self._querier = session.declare_querier(f"{root}/join/*/*")
-        if has_match(self._querier):
+        replies = session.get(self._key, target=zenoh.QueryTarget.ALL, timeout=CONNECT_TIMEOUT)
+        # a querier would tell it without queries, but with one a router of Zenoh 1.10 may panic when a link is lost
+        if any(reply.ok and reply.replier_id and reply.replier_id.zid != session.info.zid() for reply in replies):
             self._missing_since = None
             if self.trouble:
                 self.trouble = ""

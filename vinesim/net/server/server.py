@@ -90,11 +90,11 @@ class Server:
         """Listen on endpoints like ``tcp/0.0.0.0:7377``. Port 0 chooses a free port, see :attr:`endpoint`.
 
         ``connect``: endpoints of routers or servers to link to. A server that is linked to another one only routes. The
-        server that connects to no other one admits actors and retains records. If that one does not answer, a warning tells
-        it, and this server goes on trying. ``state_folder``: folder of the
-        journals; None: retained records are lost when the server ends. ``scene``: the only scene that is allowed.
-        ``max_actors``: largest number of actors at a time. ``spectators_speak_to``: who hears spectators. ``quota``:
-        rate at which one actor may publish records.
+        server that connects to no other one admits actors and retains records. If that one does not answer, a warning
+        tells it, and this server goes on trying. ``state_folder``: folder of the journals; None: retained records are
+        lost when the server ends. ``scene``: the only scene that is allowed. ``max_actors``: largest number of actors
+        at a time. ``spectators_speak_to``: who hears spectators. ``quota``: rate at which one actor may publish
+        records.
 
         ``certificates``: folder of the server's certificates (:mod:`vinesim.net.transport.certificates`), which is read
         again when its files change. With it, ``world`` is the only world, and every actor needs a certificate.
@@ -158,7 +158,7 @@ class Server:
         if self._watcher is not None:
             self._watcher.start()
         threading.Thread(target=self._run_clocks, name="clocks of the worlds", daemon=True).start()
-        self._main_server = MainServerWatch(linked) if linked else None
+        self._main_server = MainServerWatch(linked, f"{ROOT}/{world}/server/{SERVER}") if linked else None
         if linked:
             threading.Thread(target=self._watch_main_server, name="watch of the main server", daemon=True).start()
         log.info("listening on %s", ", ".join(map(str, self.endpoints)))
@@ -248,12 +248,11 @@ class Server:
                     clock.advance(now)
 
     def _watch_main_server(self) -> None:
-        """Body of the thread that looks for the server that keeps the world, if this one only routes."""
+        """Body of the thread that looks for the server to which this one is linked."""
         assert self._main_server is not None
         while not self._stop.wait(WATCH_PERIOD):
-            with self._session_lock, contextlib.suppress(zenoh.ZError):  # a router that failed to open again is closed
-                if not self._session.is_closed():
-                    self._main_server.check(self._session, self._root, time.monotonic())
+            with contextlib.suppress(zenoh.ZError):  # the session was closed meanwhile
+                self._main_server.check(self._session, time.monotonic())
 
     def figures(self) -> dict[str, Any]:
         """Returns the content of a status line: live actors, number of links, clocks, and counters since the start."""
