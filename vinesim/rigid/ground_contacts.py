@@ -92,7 +92,7 @@ class GroundContacts:
         """Whether geoms at ``center`` [n, 3] m with bounding spheres of ``radius`` [n] m reach beyond the grid [n]."""
         low = center[:, :2] - radius[:, None] < self._terrain.origin
         high = center[:, :2] + radius[:, None] > self._terrain.end
-        return (low | high).any(1)
+        return (low | high).max(1)
 
     @staticmethod
     def _make_room(m: mujoco.MjModel, d: mujoco.MjData, slots: np.ndarray, count: int) -> np.ndarray:
