@@ -1,4 +1,5 @@
-"""Every test process has its own ROS domain with discovery on this host only; in CI a skipped test fails."""
+"""Every test process has its own ROS domain with discovery on this host only, and ends what it has started; in CI a
+skipped test fails."""
 
 from __future__ import annotations
 
@@ -10,11 +11,14 @@ from collections.abc import Generator, Iterator
 import hypothesis
 import pytest
 
+from tests.support import orphans
+
 if "PYTEST_XDIST_WORKER" in os.environ or "ROS_DOMAIN_ID" not in os.environ:
     # also in a worker, which inherits the domain of the process that started it
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+orphans.end_with_this_process()
 
 hypothesis.settings.register_profile("test", max_examples=25, deadline=None)
 hypothesis.settings.register_profile("test-long", max_examples=300, deadline=None)

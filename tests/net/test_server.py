@@ -216,6 +216,38 @@ def test_a_router_of_another_program_is_no_server(tokens, words, is_live):
     close_session(router)
 
 
+def watched(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records if "main_server_watch" in record.name]
+
+
+def test_a_linked_server_says_that_no_server_answers_and_finds_the_one_that_appears(caplog):
+    (endpoint,) = resolve_ports(["tcp/127.0.0.1:0"])
+    with contextlib.ExitStack() as stack:
+        linked = Server("tcp/127.0.0.1:0", connect=[str(endpoint)])
+        wait(lambda: linked.figures()["trouble"], "the server to report a port where nobody listens")
+        stack.enter_context(Server(str(endpoint)))
+        stack.enter_context(linked)  # it ends first
+        wait(lambda: not linked.figures()["trouble"], "the server that keeps the world")
+    missing, found = watched(caplog)
+    assert missing.startswith(f"no vinesim server answers at {endpoint} within 4 s (no connection): start one with")
+    assert missing.endswith("this server goes on trying")
+    assert "\n" not in missing
+    assert str(endpoint) in found
+
+
+def test_a_linked_server_says_that_a_router_of_another_program_is_no_server(caplog):
+    (endpoint,) = resolve_ports(["tcp/127.0.0.1:0"])
+    router = open_session(config("router", listen__endpoints=[endpoint.locator]))
+    with Server("tcp/127.0.0.1:0", connect=[str(endpoint)]) as linked:
+        wait(lambda: linked.figures()["trouble"], "the server to report the router")
+        (line,) = watched(caplog)
+        assert linked.figures()["trouble"] == line
+    close_session(router)
+    assert line.startswith(f"no vinesim server there: at {endpoint} is a Zenoh router")
+    assert line.endswith("this server goes on trying")
+    assert "\n" not in line
+
+
 def test_the_default_port_is_none_of_zenoh_or_dds():
     """DDS gives participant p of domain d the ports 7400 + 250 d + 10 + 2 p and the next one."""
     assert endpoints.PORT != 7447

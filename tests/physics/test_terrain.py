@@ -22,12 +22,14 @@ from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.odometry import SLOPE_SLIP
 from vinesim.scene.builder import assemble
 from vinesim.scene.cane import CaneBuilder
-from vinesim.scene.generation.vineyard import generate_uncached
+from vinesim.scene.generation.vineyard import generate, generate_uncached
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.spec import TerrainTable, load_scene
 from vinesim.scene.state import State
-from vinesim.scene.terrain import Terrain
+from vinesim.scene.terrain import Terrain, above_ground
 from vinesim.scene.values import HumanSpec
+from vinesim.sensors.primitives.ray_caster import RayCaster
+from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
 from vinesim.wind.shelter import TreeDrag
 from vinesim.world import Physics
 
@@ -158,13 +160,81 @@ def test_contacts_that_are_not_used_have_no_rows() -> None:
     assert rigid.penetrations() == [] or max(depth for *_, depth in rigid.penetrations()) < 2e-3
 
 
-def test_beyond_the_grid_a_box_is_caught() -> None:
-    terrain = incline(0.1, nodes=21)
+def ridges() -> Terrain:
+    """Smooth ridges on an inclined plane, in x and in y, up to the edges of the grid and hence beyond."""
+    terrain = incline(0.1, -0.05, nodes=81)
+    at = terrain.origin[0] + terrain.cell * np.arange(81)
+    height = 0.05 * np.sin(1.2 * at) + 0.05 * np.sin(0.9 * at)[:, None]
+    return dataclasses.replace(terrain, residual=height.astype(np.float32))
+
+
+PLACES = {
+    "on the grid": (1.0, 0.5),
+    "across its edge": (4.05, 0.5),
+    "beyond it": (7.0, 0.5),
+    "at a corner": (9.0, -8.0),
+}
+
+
+@pytest.mark.parametrize("place", PLACES.values(), ids=PLACES)
+def test_a_box_rests_on_the_heights_that_rays_meet_also_beyond_the_grid(place: tuple[float, float]) -> None:
+    terrain = ridges()
     model = bare(terrain, boxes=1)
-    model.box_pose[0] = frames.pose([5.0, 0.0, 1.0])
+    resting = terrain.resting_pose(*place, 0.0, (0.2, 0.15))
+    model.box_pose[0] = frames.compose(resting, frames.pose([0.0, 0.0, 0.05]))
     rigid = RigidWorld(model)
     step(rigid, 200)
-    assert rigid.visual_q()[0, 2] == pytest.approx(0.5, abs=0.1)
+    rest = rigid.visual_q()[0].copy()
+    assert rest[:3] == pytest.approx(resting[:3], abs=0.01)
+    corners = np.array([[x, y, 0.0] for x in (-0.2, 0.2) for y in (-0.15, 0.15)])
+    points = rest[:3] + frames.rotate(rest[3:], corners)
+    primitives = Primitives(bare(terrain), grass=0.0)
+    primitives.update(rest_snapshot(bare(terrain)))
+    down = np.tile([0.0, 0.0, -1.0], (4, 1))
+    distance, _ = RayCaster(primitives).cast(points + np.array([0.0, 0.0, 1.0]), down, 9.0)
+    gap = distance - 1.0
+    assert distance == pytest.approx(points[:, 2] + 1.0 - terrain.height(points[:, 0], points[:, 1]), abs=1e-5)
+    assert gap.min() == pytest.approx(0.0, abs=2e-3)
+    assert gap.max() < 0.01  # the ridges rise less than that under a box
+
+
+def stay_awake(rigid: RigidWorld) -> None:
+    """Switch off MuJoCo's sleep, which would hide a slow motion."""
+    rigid.mj_model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+
+
+@pytest.mark.parametrize("x", [0.0, 5.95, 9.0], ids=["on the grid", "across its edge", "beyond it"])
+@pytest.mark.parametrize("slope", [0.1, 0.45])
+def test_a_box_does_not_creep_where_friction_holds(slope: float, x: float) -> None:
+    terrain = incline(slope)
+    model = bare(terrain, boxes=1)
+    model.box_pose[0] = terrain.resting_pose(x, 0.2, 0.3, (0.2, 0.15))
+    rigid = RigidWorld(model)
+    stay_awake(rigid)
+    step(rigid, 50)
+    start = rigid.visual_q()[0].copy()
+    step(rigid, 500)
+    assert np.linalg.norm(rigid.visual_q()[0, :3] - start[:3]) < 2e-5
+
+
+def test_bunches_that_were_cut_do_not_creep_on_the_slope() -> None:
+    physics = Physics(generate(load_scene("slope")))
+    bunches = [0, 2, 5]
+    for bunch in bunches:
+        physics.pick(bunch)
+
+    def run(steps: int) -> np.ndarray:
+        for _ in range(steps):
+            stay_awake(physics.rigid)
+            physics.step()
+        poses = zip(physics.rigid.visuals(), physics.rigid.visual_q(), strict=True)
+        return np.array([pose[:3] for link, pose in poses if link.name in {f"bunch/{one}" for one in bunches}])
+
+    start = run(300)  # they fall and roll
+    terrain = physics.model.terrain
+    assert len(start) == 3
+    assert (above_ground(terrain, start) < 0.15).all()
+    assert np.linalg.norm(run(500) - start, axis=1).max() < 5e-4
 
 
 def test_hands_take_nothing_of_the_ground() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -45,6 +46,34 @@ def test_a_signal_is_minus_its_number() -> None:
 def test_a_program_that_does_not_end_is_killed() -> None:
     with pytest.raises(subprocess.TimeoutExpired):
         programs.run([sys.executable, "-c", "import threading; threading.Event().wait()"], timeout=0.2)
+
+
+STARTS = """
+import subprocess, sys, threading
+from tests.support import orphans, programs
+orphans.end_with_this_process()
+waits = "import subprocess, sys; child = subprocess.Popen(['sleep', 'infinity'], start_new_session=True); "
+waits += "print(child.pid, flush=True); child.wait()"
+for start in (programs.Popen, subprocess.Popen):
+    one = start([sys.executable, "-c", waits], stdout=subprocess.PIPE, text=True)
+    print(one.pid, one.stdout.readline(), flush=True)
+threading.Event().wait()
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL, signal.SIGINT])
+def test_what_tests_have_started_ends_with_them(number: signal.Signals) -> None:
+    """Also what their programs have started, in sessions of their own."""
+    with subprocess.Popen([sys.executable, "-c", STARTS], stdout=subprocess.PIPE, text=True) as tests:
+        assert tests.stdout is not None
+        pids = [int(word) for _ in range(4) for word in tests.stdout.readline().split()]
+        ends = [os.pidfd_open(pid) for pid in pids]
+        assert len(ends) == 4
+        assert not select.select(ends, [], [], 0.0)[0]
+        tests.send_signal(number)
+    waiting.wait(lambda: len(select.select(ends, [], [], 0.0)[0]) == 4, "all programs to end")
+    for end in ends:
+        os.close(end)
 
 
 def test_a_limit_is_never_shorter_than_on_an_idle_machine() -> None:

@@ -80,7 +80,7 @@ def static_geoms(m: mujoco.MjModel, terrain: Terrain | None = None) -> RigidGeom
     """Returns the geoms of ground, trellis and old wood, which are MuJoCo's first geoms, whichever actors exist.
 
     Uneven ground is a list of square tiles with the index of MuJoCo's height field, so that their boxes are low. The
-    plane that catches objects beyond the height field is not among the geoms.
+    plane by which MuJoCo finds bodies beyond the height field is not among the geoms.
     """
     ids = np.flatnonzero((m.geom_bodyid == 0) & (m.geom_contype != 0))
     if terrain is not None:

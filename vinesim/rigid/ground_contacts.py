@@ -3,8 +3,8 @@
 MuJoCo tests a body against every triangular prism of a height field on its own. So a body that slides also meets the
 inner sides of prisms: a crate on an incline of 10 cm cells slid at less than half of the acceleration that friction
 allows. A body on many cells exceeds MuJoCo's 50 contacts a pair, and is then held on one side only. Here MuJoCo only
-finds which geoms are near the ground. Their contacts are then replaced by contacts of points of their surface, with the
-ground's normal (docs/decisions/terrain.md).
+finds which geoms are near the ground, by its height field and, beyond it, by a plane above the ground. Their contacts
+are then replaced by contacts of points of their surface, with the ground's normal (docs/decisions/terrain.md).
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ COMPASS = 8
 these directions."""
 APART = 1.0
 """Gap [m] of MuJoCo's contacts that are not used."""
+_HEIGHT_FIELD = int(mujoco.mjtGeom.mjGEOM_HFIELD)
+"""MuJoCo's type of the height field; that of a plane is less, those of all other geoms are greater."""
 _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX, _MESH = (
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))
     for name in ("SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH")
@@ -47,34 +49,59 @@ class GroundContacts:
         self._samples.clear()
 
     def apply(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
-        """After ``mj_step1``: replace the contacts with the height field, and make MuJoCo's constraints again."""
+        """After ``mj_step1``: replace the contacts with the ground, and make MuJoCo's constraints again."""
         if d.ncon == 0:
             return
-        contact = d.contact
-        pair = contact.geom
-        ours = np.flatnonzero(m.geom_type[pair].min(1) == int(mujoco.mjtGeom.mjGEOM_HFIELD))
+        pair = d.contact.geom
+        kind = m.geom_type[pair].min(1)
+        ours = np.flatnonzero(kind <= _HEIGHT_FIELD)
         if not len(ours):
             return
-        geom = pair[ours].max(1)  # the ground has MuJoCo's first geom
-        flip = np.where(pair[ours, 0] == geom, -1.0, 1.0)
-        point, normal, gap, owner = self._touching(m, d, np.unique(geom))
+        geom = pair[ours].max(1)  # the ground has MuJoCo's first geoms
+        is_near = (kind[ours] == _HEIGHT_FIELD) | self._reaches_out(d.geom_xpos[geom], m.geom_rbound[geom])
+        contact = d.contact
         contact.exclude[ours] = 1
         contact.dist[ours] = APART
         contact.efc_address[ours] = -1
-        for one in np.unique(geom).tolist():
-            slots = ours[geom == one]
-            found = np.flatnonzero(owner == one)
-            found = found[np.argsort(gap[found], kind="stable")][: len(slots)]
-            slots = slots[: len(found)]
-            contact.exclude[slots] = gap[found] >= contact.includemargin[slots]
-            contact.dist[slots] = gap[found]
-            contact.pos[slots] = point[found]
-            sign = flip[geom == one][: len(found), None]
-            contact.frame[slots] = _axes(sign * normal[found])
+        if is_near.any():
+            self._add_contacts(m, d, ours[is_near], geom[is_near])
         mujoco.mj_makeConstraint(m, d)
         mujoco.mj_island(m, d)
         mujoco.mj_projectConstraint(m, d)
         mujoco.mj_fwdVelocity(m, d)
+
+    def _add_contacts(self, m: mujoco.MjModel, d: mujoco.MjData, slots: np.ndarray, geom: np.ndarray) -> None:
+        """Add the contacts of geoms with the ground. ``slots`` [n]: indices of contacts that are not used; ``geom``
+        [n]: the geom of each."""
+        geoms = np.unique(geom)
+        point, normal, gap, owner = self._touching(m, d, geoms)
+        count = [int((owner == one).sum()) for one in geoms.tolist()]
+        rooms = [self._make_room(m, d, slots[geom == one], n) for one, n in zip(geoms.tolist(), count, strict=True)]
+        contact = d.contact
+        for one, room in zip(geoms.tolist(), rooms, strict=True):
+            found = np.flatnonzero(owner == one)
+            found = found[np.argsort(gap[found], kind="stable")][: len(room)]
+            room = room[: len(found)]
+            contact.exclude[room] = gap[found] >= contact.includemargin[room]
+            contact.dist[room] = gap[found]
+            contact.pos[room] = point[found]
+            sign = np.where(contact.geom[room, 0] == one, -1.0, 1.0)[:, None]
+            contact.frame[room] = _axes(sign * normal[found])
+
+    def _reaches_out(self, center: np.ndarray, radius: np.ndarray) -> np.ndarray:
+        """Whether geoms at ``center`` [n, 3] m with bounding spheres of ``radius`` [n] m reach beyond the grid [n]."""
+        low = center[:, :2] - radius[:, None] < self._terrain.origin
+        high = center[:, :2] + radius[:, None] > self._terrain.end
+        return (low | high).max(1)
+
+    @staticmethod
+    def _make_room(m: mujoco.MjModel, d: mujoco.MjData, slots: np.ndarray, count: int) -> np.ndarray:
+        """Returns the indices of ``count`` contacts of a geom with the ground, or more: its ``slots``, and copies of
+        the first as long as MuJoCo has room for contacts."""
+        first = d.ncon
+        while len(slots) + d.ncon - first < count and mujoco.mj_addContact(m, d, d.contact[slots[0]]) == 0:
+            pass
+        return np.concatenate([slots, np.arange(first, d.ncon)])
 
     def _touching(
         self, m: mujoco.MjModel, d: mujoco.MjData, geoms: np.ndarray

@@ -34,8 +34,9 @@ pieces follow; the ground has number 0.
 
 HEIGHT_FIELD_DEPTH = 1.0
 """Thickness [m] of the ground below the lowest point of MuJoCo's height field. Its surface alone matters."""
-CATCHING_PLANE_DEPTH = 0.02
-"""Depth [m] of the plane beyond the height field below its lowest point, so that the plane touches nothing on it."""
+OUTER_PLANE_RISE = 0.02
+"""Height [m] of the plane beyond the height field above its highest point, so that MuJoCo reports all that is near the
+ground there."""
 
 GROUND, FIXED, BOX, CRATE_FLOOR, FREE_BUNCH, REMOTE_HAND = (1 << bit for bit in range(6))
 """Collision bits. Free bunches collide with the thick bed of a crate, all other bodies with its thin floor. Robots do
@@ -120,7 +121,7 @@ def build_static_world(
             userdata=geom_user(material[piece]),
         )
     if model.terrain is not None:
-        _add_catching_plane(spec, model.terrain, ground)
+        _add_outer_plane(spec, model.terrain, ground)
     for number, box in (boxes_of(model) if boxes is None else boxes).items():
         turn = frames.to_wxyz(frames.normalize(box.pose[3:]))
         body = spec.worldbody.add_body(name=f"box/{number}", pos=box.pose[:3], quat=turn)
@@ -147,14 +148,19 @@ def _add_height_field(spec: mujoco.MjSpec, terrain: Terrain, ground: dict[str, A
     spec.worldbody.add_geom(name="ground", type=kind, hfieldname="ground", pos=[*middle, low], **ground)
 
 
-def _add_catching_plane(spec: mujoco.MjSpec, terrain: Terrain, ground: dict[str, Any]) -> None:
-    """Add an inclined plane just below the lowest point of the height field, so that objects beyond its edge do not
-    fall for ever."""
+def _add_outer_plane(spec: mujoco.MjSpec, terrain: Terrain, ground: dict[str, Any]) -> None:
+    """Add an inclined plane above the highest point of the ground. It only tells which bodies may touch the ground
+    beyond the height field; their contacts are computed by :mod:`vinesim.rigid.ground_contacts`."""
     along, across = terrain.slope
-    turn = frames.to_wxyz(tilt(0.0, along, across))
-    height = float(terrain.residual.min()) - CATCHING_PLANE_DEPTH
-    kind = mujoco.mjtGeom.mjGEOM_PLANE
-    spec.worldbody.add_geom(name="beyond", type=kind, size=[0, 0, 1], pos=[0.0, 0.0, height], quat=turn, **ground)
+    spec.worldbody.add_geom(
+        name="outer ground",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0, 0, 1],
+        pos=[0.0, 0.0, float(terrain.residual.max()) + OUTER_PLANE_RISE],
+        quat=frames.to_wxyz(tilt(0.0, along, across)),
+        rgba=[0.0, 0.0, 0.0, 0.0],  # invisible, so that rays pass
+        **ground,
+    )
 
 
 def _set_options(spec: mujoco.MjSpec, parameters: PhysicsParameters) -> None:

@@ -58,7 +58,16 @@ def any_of_warp(value: bool) -> bool:
     ...
 
 
-@wp.func_native(_on_gpu("return __reduce_max_sync(ALL, value);"))
+@wp.func_native(
+    _on_gpu("""
+#if __CUDA_ARCH__ >= 800
+return __reduce_max_sync(ALL, value);
+#else  // Turing
+for (int other = 16; other > 0; other /= 2) value = max(value, __shfl_xor_sync(ALL, value, other));
+return value;
+#endif
+""")
+)
 def most_of_warp(value: int) -> int:
     """Returns the largest value of the warp's threads. The compiler knows that all threads get the same result."""
     ...

@@ -6,6 +6,7 @@ server simulates nothing. Of the state of the world it subscribes to retained re
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import pathlib
 import threading
@@ -24,6 +25,7 @@ from vinesim.net.codec.meshes import decode_part, decode_request, encode_part, e
 from vinesim.net.pace import MIN_FACTOR, WorldClock
 from vinesim.net.replication.interest import Cell
 from vinesim.net.server.admission import AdmissionControl, SceneId
+from vinesim.net.server.main_server_watch import WATCH_PERIOD, MainServerWatch
 from vinesim.net.server.mesh_store import MeshStore
 from vinesim.net.server.retained_store import Quota, RetainedStore
 from vinesim.net.transport import endpoints
@@ -88,10 +90,11 @@ class Server:
         """Listen on endpoints like ``tcp/0.0.0.0:7377``. Port 0 chooses a free port, see :attr:`endpoint`.
 
         ``connect``: endpoints of routers or servers to link to. A server that is linked to another one only routes. The
-        server that connects to no other one admits actors and retains records. ``state_folder``: folder of the
-        journals; None: retained records are lost when the server ends. ``scene``: the only scene that is allowed.
-        ``max_actors``: largest number of actors at a time. ``spectators_speak_to``: who hears spectators. ``quota``:
-        rate at which one actor may publish records.
+        server that connects to no other one admits actors and retains records. If that one does not answer, a warning
+        tells it, and this server goes on trying. ``state_folder``: folder of the journals; None: retained records are
+        lost when the server ends. ``scene``: the only scene that is allowed. ``max_actors``: largest number of actors
+        at a time. ``spectators_speak_to``: who hears spectators. ``quota``: rate at which one actor may publish
+        records.
 
         ``certificates``: folder of the server's certificates (:mod:`vinesim.net.transport.certificates`), which is read
         again when its files change. With it, ``world`` is the only world, and every actor needs a certificate.
@@ -155,6 +158,9 @@ class Server:
         if self._watcher is not None:
             self._watcher.start()
         threading.Thread(target=self._run_clocks, name="clocks of the worlds", daemon=True).start()
+        self._main_server = MainServerWatch(linked, f"{ROOT}/{world}/server/{SERVER}") if linked else None
+        if linked:
+            threading.Thread(target=self._watch_main_server, name="watch of the main server", daemon=True).start()
         log.info("listening on %s", ", ".join(map(str, self.endpoints)))
 
     def _access_settings(self) -> dict[str, Any]:
@@ -241,6 +247,13 @@ class Server:
                 for clock in self._clocks.values():
                     clock.advance(now)
 
+    def _watch_main_server(self) -> None:
+        """Body of the thread that looks for the server to which this one is linked."""
+        assert self._main_server is not None
+        while not self._stop.wait(WATCH_PERIOD):
+            with contextlib.suppress(zenoh.ZError):  # the session was closed meanwhile
+                self._main_server.check(self._session, time.monotonic())
+
     def figures(self) -> dict[str, Any]:
         """Returns the content of a status line: live actors, number of links, clocks, and counters since the start."""
         figures: dict[str, Any] = {
@@ -254,6 +267,8 @@ class Server:
             "foreign": self.foreign,
             "clocks": self._clock_figures(),
         }
+        if self._main_server is not None:
+            figures["trouble"] = self._main_server.trouble
         if self.store is not None:
             counters = self.store.counters
             figures |= {

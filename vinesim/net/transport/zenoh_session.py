@@ -39,9 +39,10 @@ EXIT_TIMEOUT = 10.0
 class ServerUnreachable(BusError):
     """No server answers at an endpoint."""
 
-    def __init__(self, endpoint: str, reason: str) -> None:
+    def __init__(self, endpoint: str, reason: str, waited: float = CONNECT_TIMEOUT) -> None:
+        """``waited``: time without an answer [s]."""
         super().__init__(
-            f"no vinesim server answers at {endpoint} within {CONNECT_TIMEOUT:g} s ({reason}): "
+            f"no vinesim server answers at {endpoint} within {waited:g} s ({reason}): "
             f"start one with 'vinesim server', or give its endpoint, e.g. {endpoint.partition('/')[0]}/HOST:{PORT}"
         )
 
