@@ -25,6 +25,7 @@ from vinesim.scene.terrain import Terrain
 from vinesim.scene.values import RigidVisual, Shape, Snapshot
 from vinesim.sensors.primitives import textures
 from vinesim.sensors.primitives.bunch_primitives import Ripeness, bunch_batches, bunch_bodies
+from vinesim.sensors.primitives.clutter import clutter_batches
 from vinesim.sensors.primitives.leaf_area_density import LeafDensity
 from vinesim.sensors.primitives.plant_primitives import cane_batch, leaf_batches
 from vinesim.sensors.primitives.primitive_batches import Batch, placeholder_batch
@@ -216,6 +217,7 @@ class Primitives:
         every = np.arange(len(model.bunch_body))
         pieces = [bunch_bodies(model, int(bunch)) for bunch in every]
         batches += bunch_batches(model, every, None, pieces, model.body_tree[model.bunch_body], self._ripeness)
+        batches += clutter_batches(model, self._wires, static, low, high)
         around = [*trellis_batches(model, static), wire_batch(model, self._wires, self._bodies, len(model.tree_first))]
         if grass > 0.0:
             age = float(model.leaf_age.mean()) if len(model.leaf_age) else 0.0
