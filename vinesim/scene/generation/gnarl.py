@@ -17,7 +17,10 @@ TRUNK_PIECES = 14
 POST_KINDS = ("wood", "concrete", "steel")
 POST_RADIUS = {"steel": 0.026}
 """[m] Radius in contacts of those kinds of posts that are not as thick as the plant file says. GUESSED."""
-_OLD_ARM = (0.026, 0.017)
+MAX_STEP = 0.008
+"""[m] Largest difference of the radii of a piece: in contacts with rigid bodies a piece has its mean radius, so picture
+and contact differ by at most half of it."""
+_OLD_ARM = (0.028, 0.019)
 """[m] Radius of an old arm at the trunk and at its end: GUESSED from photographs, 4 to 6 cm thick."""
 _DROP = 0.10
 """[m] Depth of the head of an old trunk below that of a young one; the arms rise from it in a bow. GUESSED."""
@@ -58,11 +61,11 @@ def gnarled_trunks(
     points[..., 2] = trunk[:, :1, 2] + (points[..., 2] - trunk[:, :1, 2]) * (1.0 - age * _DROP / head)[:, None]
     bend = np.stack([_smooth(g.normal(size=(_KNOTS, 2)), TRUNK_PIECES) for g in rngs])
     free = (4.0 * up * (1.0 - up))[:, None]
-    points[..., :2] += age * 0.028 * bend * free
+    points[..., :2] += age * 0.034 * bend * free
     lumps = np.stack([_smooth(g.uniform(-1.0, 1.0, (2 * _KNOTS, 1)), TRUNK_PIECES)[:, 0] for g in rngs])
     foot = 0.35 * np.maximum(1.0 - up / 0.14, 0.0) ** 2
     shoulder = 0.16 * np.maximum(1.0 - (1.0 - up) / 0.2, 0.0)
-    return points, thick * (1.0 + age * (0.17 * lumps + foot + shoulder - 0.12))
+    return points, _gentle(thick * (1.0 + age * (0.20 * lumps + foot + shoulder - 0.12)))
 
 
 def gnarled_arms(
@@ -79,7 +82,7 @@ def gnarled_arms(
     along = np.linspace(0.0, 1.0, ARM_PIECES + 1)
     points[..., 2] -= (arms[:, :, :1, 2] - head[:, None, None, 2]) * np.maximum(1.0 - along / 0.28, 0.0) ** 2
     bend = np.stack([[_smooth(g.normal(size=(_KNOTS, 3)), ARM_PIECES) for _ in range(count)] for g in rngs])
-    points += age * np.array([0.007, 0.013, 0.014]) * bend * np.minimum(along / 0.2, 1.0)[:, None]
+    points += age * np.array([0.008, 0.018, 0.019]) * bend * np.minimum(along / 0.2, 1.0)[:, None]
     points[..., 2] = np.minimum(points[..., 2], scene.layout.height + 0.02)
     lumps = np.stack(
         [
@@ -87,9 +90,18 @@ def gnarled_arms(
             for g in rngs
         ]
     )
-    old = (_OLD_ARM[0] * (1.0 - along) + _OLD_ARM[1] * along) * (1.0 + 0.22 * lumps)
+    old = (_OLD_ARM[0] * (1.0 - along) + _OLD_ARM[1] * along) * (1.0 + 0.30 * lumps)
     join = np.maximum(1.0 - along / 0.1, 0.0) * 0.010
-    return points, thick + age * (old + join - thick)
+    return points, _gentle(thick + age * (old + join - thick))
+
+
+def _gentle(radius: np.ndarray) -> np.ndarray:
+    """Returns ``radius`` [..., point] m, changed so that neighbours differ by at most :data:`MAX_STEP`."""
+    radius = radius.copy()
+    for i in range(1, radius.shape[-1]):
+        before = radius[..., i - 1]
+        radius[..., i] = np.clip(radius[..., i], before - MAX_STEP, before + MAX_STEP)
+    return radius
 
 
 def _resampled(points: np.ndarray, pieces: int) -> np.ndarray:

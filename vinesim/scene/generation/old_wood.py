@@ -12,12 +12,12 @@ import numpy as np
 
 from vinesim.core import frames
 from vinesim.scene.generation.fixed_structure import FixedStructure
-from vinesim.scene.generation.gnarl import random_directions, vine_generators
+from vinesim.scene.generation.gnarl import MAX_STEP, random_directions, vine_generators
 from vinesim.scene.ids import Organ
 from vinesim.scene.spec import Scene
 
 SHOOTS_ON_SPUR = 2
-_KNOBS = 4
+_KNOBS = 5
 """Number of knobs of a spur head."""
 _ARM_BURLS = 4
 _ARM_STUBS = 2
@@ -142,15 +142,15 @@ def _add_spur(
     rise = middle - foot
     out = frames.normalize(rise)
     head = foot + rise * g.uniform(0.55, 0.75)
-    wide = age * g.uniform(0.014, 0.021) + (1.0 - age) * 0.007
-    pieces.add(foot + out * 0.2 * thick, head, 0.92 * thick, wide, Organ.ARM, index)
+    wide = age * g.uniform(0.016, 0.025) + (1.0 - age) * 0.007
+    pieces.add(foot + out * 0.2 * thick, head, min(0.92 * thick, wide + MAX_STEP), wide, Organ.ARM, index)
     for base in shoots:
-        pieces.add(head, base, 0.72 * wide, age * g.uniform(0.0065, 0.0085) + (1.0 - age) * 0.005, Organ.ARM, index)
+        pieces.add(head, base, 0.62 * wide, age * g.uniform(0.0065, 0.0085) + (1.0 - age) * 0.005, Organ.ARM, index)
     for direction in random_directions(g, _KNOBS):
         direction = frames.normalize(direction + 0.25 * out)
-        size = age * g.uniform(0.45, 0.8) * wide
+        size = age * g.uniform(0.40, 0.8) * wide
         centre = head - out * g.uniform(0.0, 0.5) * thick
-        pieces.add(centre, centre + direction * (wide + size) * g.uniform(0.55, 0.9), 1.15 * size, size, Organ.ARM, index)
+        pieces.add(centre, centre + direction * (wide + size) * g.uniform(0.5, 0.95), 1.15 * size, size, Organ.ARM, index)
     for direction in random_directions(g, 1 + int(g.random() < 0.5)):
         direction = frames.normalize(direction + 0.9 * out)
         size = g.uniform(0.0048, 0.0078)

@@ -25,12 +25,13 @@ from vinesim.sensors.raster.primitive_arrays import BOX, CONE, CYLINDER, LEAF
 from vinesim.wires.wire_segments import WireSegments, cut
 
 # Colours [linear RGB reflectance]: all GUESSED by eye, beside photographs of vineyards.
+OLD_BARK_TINT = (0.135, 0.108, 0.086)
 BARK_STRIP_TINTS = ((0.15, 0.115, 0.085), (0.23, 0.19, 0.15), (0.09, 0.065, 0.05))
-CUT_TINTS = ((0.34, 0.27, 0.19), (0.24, 0.22, 0.19), (0.16, 0.13, 0.10))
+CUT_TINTS = ((0.27, 0.21, 0.15), (0.19, 0.17, 0.15), (0.11, 0.09, 0.07))
 TENDRIL_TINTS = ((0.17, 0.23, 0.07), (0.24, 0.13, 0.06))
 """Fresh and old tendrils."""
 DEAD_LEAF_TINTS = ((0.20, 0.115, 0.05), (0.13, 0.078, 0.042), (0.29, 0.20, 0.10))
-STRAW_TINTS = ((0.50, 0.40, 0.23), (0.36, 0.27, 0.15), (0.30, 0.29, 0.13))
+STRAW_TINTS = ((0.55, 0.45, 0.28), (0.40, 0.31, 0.18), (0.32, 0.30, 0.14))
 PRUNING_TINTS = ((0.20, 0.13, 0.08), (0.27, 0.24, 0.20))
 HOSE_TINT = (0.022, 0.022, 0.024)
 TIE_TINTS = ((0.10, 0.30, 0.12), (0.60, 0.60, 0.56), (0.06, 0.14, 0.32), (0.03, 0.03, 0.03), (0.42, 0.34, 0.20))
@@ -46,7 +47,7 @@ MAX_STRAW = 26_000
 MAX_PRUNINGS = 6_000
 MAX_TIES = 3_000
 """Largest numbers of things of each kind; larger vineyards have fewer for each vine."""
-_STRAW_DENSITY = 45.0
+_STRAW_DENSITY = 70.0
 """Clumps of straw on a square metre."""
 _HOSE_RADIUS = 0.008
 _CELL = 1.0
@@ -95,6 +96,14 @@ def redrawn_posts(model: Model) -> np.ndarray:
     if model.clutter is None or model.clutter.posts == "plain":
         return np.zeros(len(model.fixed_start), bool)
     return model.fixed_organ == int(Organ.POLE)
+
+
+def with_old_bark(model: Model, material: np.ndarray, tint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns material [n] and colour [n, 3] of fixed pieces, with bark replaced by old bark if the wood is old."""
+    if model.clutter is None or model.clutter.old_wood == 0.0:
+        return material, tint
+    bark = material == int(materials.BARK)
+    return np.where(bark, int(materials.OLD_BARK), material), np.where(bark[:, None], OLD_BARK_TINT, tint)
 
 
 def _generator(model: Model, kind: int) -> np.random.Generator:
@@ -211,7 +220,7 @@ def bark_batch(model: Model, share: float, static_carrier: int) -> Batch | None:
     if not len(wood.pieces):
         return None
     rng = _generator(model, 0)
-    count = int(min(share * 5.0 * len(wood.pieces), MAX_STRIPS))
+    count = int(min(share * 7.0 * len(wood.pieces), MAX_STRIPS))
     piece, begin = wood.sample(rng, count)
     length = rng.uniform(0.04, 0.16, count)
     turn = rng.uniform(0.0, 2.0 * np.pi, count)
@@ -220,20 +229,20 @@ def bark_batch(model: Model, share: float, static_carrier: int) -> Batch | None:
     lift = np.where(peels, rng.uniform(0.004, 0.028, count), rng.uniform(-0.0005, 0.0018, count))
     twist = rng.normal(0.0, 0.35, count)
     points = []
-    steps = np.array([0.0, 0.34, 0.68, 1.0])
+    steps = np.array([0.0, 0.5, 1.0])
     for step in steps:
         place, way, radius = wood.at(piece, begin + step * length)
         side = _beside(way, turn + twist * step)
         off = radius - 0.35 * thick + lift * step**2
         sag = np.where(peels, 0.45 * lift * step**2, 0.0)
         points.append(place + side * off[:, None] - sag[:, None] * [0.0, 0.0, 1.0])
-    taper = np.array([0.55, 1.0, 0.9, 0.35])
+    taper = np.array([0.6, 1.0, 0.4])
     organ = model.fixed_organ[piece]
     points = _above_ground(model, np.stack(points, 1), thick)
     return _chains(
         points,
         thick[:, None] * taper,
-        material=np.where(peels | (rng.uniform(size=count) < 0.45), int(materials.POST), int(materials.BARK)),
+        material=np.where(peels | (rng.uniform(size=count) < 0.45), int(materials.POST), int(materials.OLD_BARK)),
         tint=_tints(rng, BARK_STRIP_TINTS, count),
         organ=organ,
         labels=organ * label(Organ(1), 0) + model.fixed_index[piece],

@@ -11,7 +11,7 @@ from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.terrain import Terrain, ground_height
 from vinesim.sensors.primitives import textures
-from vinesim.sensors.primitives.clutter import redrawn_posts
+from vinesim.sensors.primitives.clutter import redrawn_posts, with_old_bark
 from vinesim.sensors.primitives.primitive_batches import Batch, make_batch, stack_columns
 from vinesim.sensors.raster.primitive_arrays import CONE, LEAF
 from vinesim.wires.wire_segments import WireSegments, cut
@@ -79,6 +79,7 @@ def _cones(model: Model, piece: np.ndarray, begin: np.ndarray, stop: np.ndarray)
     index = model.fixed_index[piece]
     table = {o: _TRELLIS[Organ(int(o))] for o in np.unique(organ)}
     material, tint = (np.array([table[o][k] for o in organ]) for k in (0, 1))
+    material, tint = with_old_bark(model, material, tint)
     rng = np.random.default_rng(3)
     seed = rng.uniform(size=int(model.fixed_index.max()) + 1)[index] * 7.0
     # texture is continuous from part to part: distances count from the foot of a post, or along a wire
