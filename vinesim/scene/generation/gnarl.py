@@ -17,7 +17,7 @@ TRUNK_PIECES = 14
 POST_KINDS = ("wood", "concrete", "steel")
 POST_RADIUS = {"steel": 0.026}
 """[m] Radius in contacts of those kinds of posts that are not as thick as the plant file says. GUESSED."""
-MAX_STEP = 0.008
+MAX_STEP = 0.006
 """[m] Largest difference of the radii of a piece: in contacts with rigid bodies a piece has its mean radius, so picture
 and contact differ by at most half of it."""
 _OLD_ARM = (0.028, 0.019)

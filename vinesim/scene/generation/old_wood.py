@@ -145,7 +145,8 @@ def _add_spur(
     wide = age * g.uniform(0.016, 0.025) + (1.0 - age) * 0.007
     pieces.add(foot + out * 0.2 * thick, head, min(0.92 * thick, wide + MAX_STEP), wide, Organ.ARM, index)
     for base in shoots:
-        pieces.add(head, base, 0.62 * wide, age * g.uniform(0.0065, 0.0085) + (1.0 - age) * 0.005, Organ.ARM, index)
+        thin = age * g.uniform(0.0065, 0.0085) + (1.0 - age) * 0.005
+        pieces.add(head, base, min(0.62 * wide, thin + MAX_STEP), thin, Organ.ARM, index)
     for direction in random_directions(g, _KNOBS):
         direction = frames.normalize(direction + 0.25 * out)
         size = age * g.uniform(0.40, 0.8) * wide
@@ -170,7 +171,7 @@ def _add_lumps(
     index: int,
 ) -> None:
     """Add burls and stubs of old cuts at random places of a trunk or arm with points ``axis`` and ``radius``."""
-    lowest = 1 if organ is Organ.TRUNK else 0  # burls stay above the ground
+    lowest = 2 if organ is Organ.TRUNK else 0  # lumps stay above the ground
     for number in range(burls + stubs):
         k = int(g.integers(lowest, len(axis) - 1))
         share = g.random()

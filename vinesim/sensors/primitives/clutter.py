@@ -25,7 +25,7 @@ from vinesim.sensors.raster.primitive_arrays import BOX, CONE, CYLINDER, LEAF
 from vinesim.wires.wire_segments import WireSegments, cut
 
 # Colours [linear RGB reflectance]: all GUESSED by eye, beside photographs of vineyards.
-OLD_BARK_TINT = (0.135, 0.108, 0.086)
+OLD_BARK_TINT = (0.118, 0.097, 0.080)
 BARK_STRIP_TINTS = ((0.15, 0.115, 0.085), (0.23, 0.19, 0.15), (0.09, 0.065, 0.05))
 CUT_TINTS = ((0.27, 0.21, 0.15), (0.19, 0.17, 0.15), (0.11, 0.09, 0.07))
 TENDRIL_TINTS = ((0.17, 0.23, 0.07), (0.24, 0.13, 0.06))
