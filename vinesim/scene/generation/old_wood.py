@@ -184,7 +184,7 @@ def _add_lumps(
             size = age * thick * g.uniform(0.45, 0.75)
             root = place + side * (thick - 0.62 * size)
             tip = root + along * size * g.uniform(0.6, 2.2) + side * 0.12 * size
-            pieces.add(root, tip, size, 0.75 * size, organ, index)
+            pieces.add(root, tip, size, max(0.75 * size, size - MAX_STEP), organ, index)
         else:
             size = g.uniform(0.0055, 0.011)
             way = frames.normalize(side + along * g.uniform(-0.6, 0.6))

@@ -308,7 +308,7 @@ def tendril_batch(model: Model, share: float) -> Batch | None:
     out = frames.normalize(out + 0.45 * rng.normal(size=(count, 3)) + [0.4, 0.0, 0.0])
     one = _beside(out, rng.uniform(0.0, 2.0 * np.pi, count))
     two = frames.cross(out, one)
-    along, across, beside = _coil(rng, count, 12, rng.uniform(0.06, 0.20, count))
+    along, across, beside = _coil(rng, count, 12, rng.uniform(0.07, 0.26, count))
     points = base[:, None] + sum(
         (c[:, :, None] * v[:, None] for c, v in ((along, out), (across, one), (beside, two))), np.zeros(1)
     )
@@ -317,7 +317,7 @@ def tendril_batch(model: Model, share: float) -> Batch | None:
     old = rng.uniform(size=(count, 1)) ** 1.5
     return _chains(
         points,
-        np.broadcast_to(np.linspace(0.0010, 0.0005, 12), (count, 12)),
+        np.broadcast_to(np.linspace(0.0013, 0.0006, 12), (count, 12)),
         material=int(materials.STEM),
         tint=(1.0 - old) * TENDRIL_TINTS[0] + old * TENDRIL_TINTS[1],
         organ=int(Organ.CANE),
