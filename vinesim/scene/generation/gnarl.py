@@ -85,10 +85,7 @@ def gnarled_arms(
     points += age * np.array([0.008, 0.018, 0.019]) * bend * np.minimum(along / 0.2, 1.0)[:, None]
     points[..., 2] = np.minimum(points[..., 2], scene.layout.height + 0.02)
     lumps = np.stack(
-        [
-            [_smooth(g.uniform(-1.0, 1.0, (2 * _KNOTS, 1)), ARM_PIECES)[:, 0] for _ in range(count)]
-            for g in rngs
-        ]
+        [[_smooth(g.uniform(-1.0, 1.0, (2 * _KNOTS, 1)), ARM_PIECES)[:, 0] for _ in range(count)] for g in rngs]
     )
     old = (_OLD_ARM[0] * (1.0 - along) + _OLD_ARM[1] * along) * (1.0 + 0.30 * lumps)
     join = np.maximum(1.0 - along / 0.1, 0.0) * 0.010

@@ -151,7 +151,8 @@ def _add_spur(
         direction = frames.normalize(direction + 0.25 * out)
         size = age * g.uniform(0.40, 0.8) * wide
         centre = head - out * g.uniform(0.0, 0.5) * thick
-        pieces.add(centre, centre + direction * (wide + size) * g.uniform(0.5, 0.95), 1.15 * size, size, Organ.ARM, index)
+        reach = (wide + size) * g.uniform(0.5, 0.95)
+        pieces.add(centre, centre + direction * reach, 1.15 * size, size, Organ.ARM, index)
     for direction in random_directions(g, 1 + int(g.random() < 0.5)):
         direction = frames.normalize(direction + 0.9 * out)
         size = g.uniform(0.0048, 0.0078)

@@ -6,6 +6,7 @@ Tendrils, dead leaves and ties move with the shoots and wires that carry them.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -455,13 +456,17 @@ def wire_leaf_batch(model: Model, share: float, segments: WireSegments, first_ca
 # -- ground
 
 
+def _ground(model: Model, points: np.ndarray) -> np.ndarray:
+    """Returns the height [...] m of the ground at ``points`` [..., 2 or more] m."""
+    flat = points.reshape(-1, points.shape[-1])
+    height = ground_height(model.terrain, flat[:, 0], flat[:, 1]) + np.zeros(len(flat))
+    return height.reshape(points.shape[:-1])
+
+
 def _above_ground(model: Model, points: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """Returns ``points`` [n, point, 3] m, raised to ``radius`` [n] m above the ground where they are lower."""
-    flat = points.reshape(-1, 3)
-    ground = ground_height(model.terrain, flat[:, 0], flat[:, 1]) + np.zeros(len(flat))
-    least = ground.reshape(points.shape[:2]) + radius[:, None]
     points = points.copy()
-    points[..., 2] = np.maximum(points[..., 2], least)
+    points[..., 2] = np.maximum(points[..., 2], _ground(model, points) + radius[:, None])
     return points
 
 
@@ -517,9 +522,9 @@ def pruning_batch(model: Model, share: float, low: np.ndarray, high: np.ndarray,
     level = middle[:, None] + (length * t)[..., None] * way[:, None]
     level += bow[..., None] * np.stack([-way[:, 1], way[:, 0]], 1)[:, None]
     radius = rng.uniform(0.0025, 0.0052, count)
-    height = radius[:, None] + rng.uniform(0.0, 0.02, (count, 1)) * (t + 0.5) + np.abs(rng.normal(0.0, 0.002, (count, 4)))
-    ground = ground_height(model.terrain, level[..., 0].ravel(), level[..., 1].ravel()) + np.zeros(level[..., 0].size)
-    points = np.concatenate([level, (height + ground.reshape(height.shape))[..., None]], 2)
+    height = radius[:, None] + rng.uniform(0.0, 0.02, (count, 1)) * (t + 0.5)
+    height = height + np.abs(rng.normal(0.0, 0.002, (count, 4)))
+    points = np.concatenate([level, (height + _ground(model, level))[..., None]], 2)
     return _chains(
         points,
         radius[:, None] * np.array([1.0, 0.93, 0.87, 0.8]),
@@ -554,42 +559,60 @@ def hose_batch(model: Model, share: float, static_carrier: int) -> Batch | None:
     parts = []
     for number in range(int(row.max()) + 1):
         present = rng.uniform() < share
-        height = rng.uniform(0.32, 0.48)
-        sags = rng.uniform(0.0, 0.05, 1 + int((row == number).sum()))
-        wave = rng.uniform(0.0, 6.0)
+        at = model.fixed_start[pole[row == number]].astype(float)
+        line, is_support = _hose_line(model, rng, at, float(model.fixed_radius[pole].mean()))
         if not present:
             continue
-        at = model.fixed_start[pole[row == number]].astype(float)
-        at = at[np.argsort(at[:, 0])]
-        apart = float(np.median(np.diff(at[:, 0]))) if len(at) > 1 else 2.0
-        supports = np.concatenate([[at[0, 0] - 0.5 * apart], at[:, 0], [at[-1, 0] + 0.5 * apart]])
-        side = at[0, 1] + 0.5 * float(model.fixed_radius[pole].mean()) + 0.045
-        x = np.unique(np.concatenate([supports, np.arange(supports[0], supports[-1], 0.125)]))
-        span = np.clip(np.searchsorted(supports, x, "right") - 1, 0, len(supports) - 2)
-        t = (x - supports[span]) / (supports[span + 1] - supports[span])
-        z = height - sags[span] * 4.0 * t * (1.0 - t) + 0.004 * np.sin(7.0 * x + wave)
-        y = side + 0.006 * np.sin(2.3 * x + wave)
-        z = z + ground_height(model.terrain, supports, np.full(len(supports), at[0, 1]))[span] * (1.0 - t) + (
-            ground_height(model.terrain, supports, np.full(len(supports), at[0, 1]))[span + 1] * t
-        ) if model.terrain is not None else z
-        line = np.stack([x, y, z], 1)
-        name = label(Organ.WIRE, first + number)
-        common = {"material": int(materials.RUBBER), "organ": int(Organ.WIRE), "labels": name, "carrier": static_carrier}
-        parts.append(_chains(line[None], np.full((1, len(x)), _HOSE_RADIUS), tint=HOSE_TINT, **common))
-        drip = line[(np.arange(len(x)) % 4) == 1]
-        emitters = np.stack([drip - [0.014, 0.0, 0.0], drip + [0.014, 0.0, 0.0]], 1)
-        parts.append(_chains(emitters, np.full((len(drip), 2), 0.0105), tint=HOSE_TINT, **common))
-        clip = line[np.isin(x, at[:, 0])]
-        clips = np.stack([clip + [0.0, 0.0, 0.014], clip - [0.0, 0.03, -0.014]], 1)
-        parts.append(_chains(clips, np.full((len(clip), 2), 0.004), tint=HOSE_TINT, **common))
+        drip = line[(np.arange(len(line)) % 4) == 1]
+        half = np.array([0.014, 0.0, 0.0])
+        clip = line[is_support]
+        above, beside = np.array([0.0, 0.0, 0.014]), np.array([0.0, -0.03, 0.014])
+        for points, radius in (
+            (line[None], _HOSE_RADIUS),
+            (np.stack([drip - half, drip + half], 1), 0.0105),
+            (np.stack([clip + above, clip + beside], 1), 0.004),
+        ):
+            parts.append(
+                _chains(
+                    points,
+                    np.full(points.shape[:2], radius),
+                    material=int(materials.RUBBER),
+                    tint=HOSE_TINT,
+                    organ=int(Organ.WIRE),
+                    labels=label(Organ.WIRE, first + number),
+                    carrier=static_carrier,
+                )
+            )
     return _joined(parts) if parts else None
+
+
+def _hose_line(
+    model: Model, rng: np.random.Generator, poles: np.ndarray, thick: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns points [n, 3] m of a hose that hangs in bows beside ``poles`` [post, 3] m of radius ``thick`` m, and
+    whether a post holds each of them [n] bool."""
+    poles = poles[np.argsort(poles[:, 0])]
+    apart = float(np.median(np.diff(poles[:, 0]))) if len(poles) > 1 else 2.0
+    supports = np.concatenate([[poles[0, 0] - 0.5 * apart], poles[:, 0], [poles[-1, 0] + 0.5 * apart]])
+    height = rng.uniform(0.32, 0.48)
+    sags = rng.uniform(0.0, 0.05, len(supports))
+    wave = rng.uniform(0.0, 6.0)
+    x = np.unique(np.concatenate([supports, np.arange(supports[0], supports[-1], 0.125)]))
+    span = np.clip(np.searchsorted(supports, x, "right") - 1, 0, len(supports) - 2)
+    t = (x - supports[span]) / (supports[span + 1] - supports[span])
+    y = poles[0, 1] + 0.5 * thick + 0.045 + 0.006 * np.sin(2.3 * x + wave)
+    ground = _ground(model, np.stack([supports, np.full(len(supports), poles[0, 1])], 1))
+    z = height + ground[span] * (1.0 - t) + ground[span + 1] * t
+    z = z - sags[span] * 4.0 * t * (1.0 - t) + 0.004 * np.sin(7.0 * x + wave)
+    return np.stack([x, y, z], 1), np.isin(x, poles[:, 0])
 
 
 def _joined(parts: list[Batch]) -> Batch:
     """Returns batches of cones as one; their groups are squares of ground."""
-    fields = {name: np.concatenate([getattr(part, name) for part in parts]) for name in Batch.__dataclass_fields__ if name != "kind"}
-    fields["group"] = _cells(0.5 * (fields["a"] + fields["b"])[:, :3])
-    return Batch(kind=parts[0].kind, **fields)
+    names = [field.name for field in dataclasses.fields(Batch) if field.name != "kind"]
+    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    columns["group"] = _cells(0.5 * (columns["a"] + columns["b"])[:, :3])
+    return Batch(kind=parts[0].kind, **columns)
 
 
 def _rings(centre: np.ndarray, axis: np.ndarray, radius: np.ndarray, wide: float, steps: int) -> np.ndarray:

@@ -139,18 +139,17 @@ def _cells(position: np.ndarray) -> np.ndarray:
     return (cell[:, 1] * (cell[:, 0].max(initial=0) + 1) + cell[:, 0]).astype(np.int32)
 
 
-def _wood(
-    model: Model, yard: _Vineyard, rng: np.random.Generator, place: np.ndarray, static_carrier: int
-) -> Batch:
+def _wood(model: Model, yard: _Vineyard, rng: np.random.Generator, place: np.ndarray, static_carrier: int) -> Batch:
     """Returns trunks, arms, and at every third vine a post."""
     count = len(place)
     foot = stack_columns(place, ground_height(model.terrain, *place.T))
-    foot = foot + [0.15, 0.0, 0.0]
+    beside = np.array([0.15, 0.0, 0.0])
+    foot = foot + beside
     bend = rng.normal(0.0, 0.06, (count, 3)) * [1.0, 1.0, 0.8]
     knee = foot + bend + np.array([0.0, 0.0, 0.55 * yard.wire])
     head = foot + 0.5 * bend + np.array([0.0, 0.0, yard.wire - 0.06]) - [0.08, 0.0, 0.0]
     reach = 0.46 * yard.vine_spacing
-    ends = [head + [side * reach, 0.0, 0.06] + rng.normal(0.0, 0.02, (count, 3)) for side in (-1.0, 1.0)]
+    ends = [head + np.array([side * reach, 0.0, 0.06]) + rng.normal(0.0, 0.02, (count, 3)) for side in (-1.0, 1.0)]
     thick = yard.trunk * rng.uniform(0.75, 1.15, count)
     a = [foot, knee, head, head]
     b = [knee, head, *ends]
@@ -160,9 +159,9 @@ def _wood(
     tint = np.array(BARK_TINT) * rng.uniform(0.7, 1.2, (count, 1))
     tints = [tint] * 4
     with_post = np.round((place[:, 0] - yard.low[0]) / yard.vine_spacing).astype(int) % 3 == 0
-    post = foot[with_post] - [0.15, 0.0, 0.0]
+    post = foot[with_post] - beside
     a.append(post)
-    b.append(post + [0.0, 0.0, yard.top])
+    b.append(post + np.array([0.0, 0.0, yard.top]))
     radius = np.full(len(post), 0.04)
     ra.append(radius)
     rb.append(radius)
