@@ -73,21 +73,21 @@ def generate(scene: Scene) -> Model:
     )
     imported = [(load_imported_plant(one.file), msgspec.structs.replace(one, file="")) for one in scene.imported]
     digest = disk_cache.source_digest(_code_digest(), msgspec.json.encode((plants, parameters, imported, ground)))
-    model = Model(terrain=terrain, **disk_cache.load_or_make("vineyard", digest, make)).check()
-    return _with_clutter(model, scene)
+    clutter, seed = _clutter_of(scene)
+    arrays = disk_cache.load_or_make("vineyard", digest, make)
+    return Model(terrain=terrain, clutter=clutter, clutter_seed=seed, **arrays).check()
 
 
 def generate_uncached(scene: Scene) -> Model:
     """Returns the same model as :func:`generate` without using the cache. For scenes that are needed only once."""
-    return _with_clutter(_generate(scene, plant_parameters.load_plant(scene.plants), build_terrain(scene)), scene)
-
-
-def _with_clutter(model: Model, scene: Scene) -> Model:
-    """Returns ``model`` with the scene's clutter; unchanged if the scene has none."""
-    if scene.clutter != Clutter():
-        model.clutter = scene.clutter
-        model.clutter_seed = scene.seed
+    model = _generate(scene, plant_parameters.load_plant(scene.plants), build_terrain(scene))
+    model.clutter, model.clutter_seed = _clutter_of(scene)
     return model
+
+
+def _clutter_of(scene: Scene) -> tuple[Clutter | None, int]:
+    """Returns the clutter of the scene's model and its seed; None and 0 if the scene has no clutter."""
+    return (scene.clutter, scene.seed) if scene.clutter != Clutter() else (None, 0)
 
 
 @functools.cache

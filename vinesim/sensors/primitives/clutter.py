@@ -472,8 +472,8 @@ def _above_ground(model: Model, points: np.ndarray, radius: np.ndarray) -> np.nd
 
 def straw_batch(model: Model, share: float, low: np.ndarray, high: np.ndarray, static_carrier: int) -> Batch | None:
     """Returns clumps of dry grass that lie on the ground, with the ground's label; each is a flat tuft of blades."""
-    low = low - 2.0
-    high = high + 2.0
+    low = low - 4.0
+    high = high + 4.0
     count = int(min(share * _STRAW_DENSITY * np.prod(high - low), MAX_STRAW))
     if not count:
         return None
