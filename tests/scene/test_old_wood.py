@@ -80,7 +80,7 @@ def test_shoots_turn_with_pieces_of_the_arm_below_them(old) -> None:
     assert np.abs((old.tree_pose[:, :3] - middle)[:, :2]).max() < 0.10
     rise = old.tree_pose[:, 2] - middle[:, 2]
     assert rise.min() > 0.0
-    assert rise.max() < 0.13
+    assert rise.max() < 0.19
 
 
 def test_pieces_are_few_and_finite_and_above_the_ground(old) -> None:

@@ -81,8 +81,8 @@ def gnarled_arms(
     points, thick = _resampled(arms, ARM_PIECES), _resampled(radius[..., None], ARM_PIECES)[..., 0]
     along = np.linspace(0.0, 1.0, ARM_PIECES + 1)
     points[..., 2] -= (arms[:, :, :1, 2] - head[:, None, None, 2]) * np.maximum(1.0 - along / 0.28, 0.0) ** 2
-    bend = np.stack([[_smooth(g.normal(size=(_KNOTS, 3)), ARM_PIECES) for _ in range(count)] for g in rngs])
-    points += age * np.array([0.008, 0.018, 0.019]) * bend * np.minimum(along / 0.2, 1.0)[:, None]
+    bend = np.stack([[_bends(g) for _ in range(count)] for g in rngs])
+    points += age * bend * np.minimum(along / 0.2, 1.0)[:, None]
     points[..., 2] = np.minimum(points[..., 2], scene.layout.height + 0.02)
     lumps = np.stack(
         [[_smooth(g.uniform(-1.0, 1.0, (2 * _KNOTS, 1)), ARM_PIECES)[:, 0] for _ in range(count)] for g in rngs]
@@ -90,6 +90,12 @@ def gnarled_arms(
     old = (_OLD_ARM[0] * (1.0 - along) + _OLD_ARM[1] * along) * (1.0 + 0.30 * lumps)
     join = np.maximum(1.0 - along / 0.1, 0.0) * 0.010
     return points, _gentle(thick + age * (old + join - thick))
+
+
+def _bends(rng: np.random.Generator) -> np.ndarray:
+    """Returns random displacements [point, 3] m of an old arm: wide bows and short kinks."""
+    wide = _smooth(rng.normal(size=(_KNOTS // 2, 3)), ARM_PIECES) * [0.006, 0.016, 0.024]
+    return wide + _smooth(rng.normal(size=(_KNOTS, 3)), ARM_PIECES) * [0.006, 0.012, 0.013]
 
 
 def _gentle(radius: np.ndarray) -> np.ndarray:

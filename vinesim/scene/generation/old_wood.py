@@ -25,7 +25,7 @@ _TRUNK_BURLS = 6
 _TRUNK_STUBS = 1
 MAX_PIECES_PER_SPUR = 1 + SHOOTS_ON_SPUR + _KNOBS + 2
 """Neck, one foot for each shoot, knobs, and at most two stubs."""
-_SPUR_HEIGHT = (0.022, 0.060)
+_SPUR_HEIGHT = (0.022, 0.105)
 """[m] Least and greatest height of a spur head above the surface of its arm: GUESSED from photographs."""
 
 
@@ -57,8 +57,8 @@ def seat_on_spurs(scene: Scene, structure: FixedStructure, each: int) -> SpurSea
             across = frames.cross(np.array([0.0, 0.0, 1.0]), along)
             at = 0.15 + 0.83 * (np.arange(heads) + 0.25 + 0.5 * g.random(heads)) / heads
             radius = np.interp(at * (points - 1), np.arange(points), structure.arm_radius[vine, arm])
-            high = radius * 0.8 + age * (_SPUR_HEIGHT[0] + (_SPUR_HEIGHT[1] - _SPUR_HEIGHT[0]) * g.random(heads))
-            lean = 0.30 * g.normal(size=heads)
+            high = radius * 0.8 + age * (_SPUR_HEIGHT[0] + (_SPUR_HEIGHT[1] - _SPUR_HEIGHT[0]) * g.random(heads) ** 1.6)
+            lean = 0.35 * g.normal(size=heads)
             if not upright:  # below a net, spurs grow sideways, to alternating sides
                 lean = np.where(np.arange(heads) % 2, 1.0, -1.0) * (1.2 + 0.5 * g.random(heads))
             out = frames.normalize(across * lean[:, None] + [0.0, 0.0, 1.0])
@@ -142,7 +142,7 @@ def _add_spur(
     rise = middle - foot
     out = frames.normalize(rise)
     head = foot + rise * g.uniform(0.55, 0.75)
-    wide = age * g.uniform(0.016, 0.025) + (1.0 - age) * 0.007
+    wide = age * g.uniform(0.016, 0.026) + (1.0 - age) * 0.007
     pieces.add(foot + out * 0.2 * thick, head, min(0.92 * thick, wide + MAX_STEP), wide, Organ.ARM, index)
     for base in shoots:
         thin = age * g.uniform(0.0065, 0.0085) + (1.0 - age) * 0.005
@@ -150,7 +150,7 @@ def _add_spur(
     for direction in random_directions(g, _KNOBS):
         direction = frames.normalize(direction + 0.25 * out)
         size = age * g.uniform(0.40, 0.8) * wide
-        centre = head - out * g.uniform(0.0, 0.5) * thick
+        centre = head - rise * g.uniform(0.0, 0.4)
         reach = (wide + size) * g.uniform(0.5, 0.95)
         pieces.add(centre, centre + direction * reach, 1.15 * size, size, Organ.ARM, index)
     for direction in random_directions(g, 1 + int(g.random() < 0.5)):

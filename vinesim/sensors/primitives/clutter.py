@@ -38,7 +38,7 @@ HOSE_TINT = (0.022, 0.022, 0.024)
 TIE_TINTS = ((0.10, 0.30, 0.12), (0.60, 0.60, 0.56), (0.06, 0.14, 0.32), (0.03, 0.03, 0.03), (0.42, 0.34, 0.20))
 WOODEN_POST_TINTS = ((0.27, 0.20, 0.135), (0.30, 0.275, 0.24), (0.17, 0.135, 0.09))
 CONCRETE_TINT = (0.42, 0.40, 0.365)
-STEEL_TINTS = ((0.46, 0.47, 0.48), (0.21, 0.105, 0.06))
+STEEL_TINTS = ((0.37, 0.385, 0.40), (0.21, 0.105, 0.06))
 """Galvanised, and rusty."""
 
 MAX_STRIPS = 30_000
@@ -480,9 +480,9 @@ def straw_batch(model: Model, share: float, low: np.ndarray, high: np.ndarray, s
     rng = _generator(model, 6)
     position = low + (high - low) * rng.uniform(size=(count, 2))
     noise = textures.sample_noise(position[:, 0] * 0.13, position[:, 1] * 0.13)
-    position = position[noise[:, 1] > 0.15 + 0.35 * rng.uniform(size=count)]
+    position = position[noise[:, 1] > 0.05 + 0.30 * rng.uniform(size=count)]
     count = len(position)
-    size = rng.uniform(0.07, 0.17, count)
+    size = rng.uniform(0.09, 0.22, count)
     yaw = rng.uniform(0.0, 2.0 * np.pi, count)
     tilt = rng.uniform(0.0, 0.22, count)
     rib = np.stack([np.cos(tilt) * np.cos(yaw), np.cos(tilt) * np.sin(yaw), np.sin(tilt)], 1)
@@ -733,7 +733,6 @@ def _box_posts(
     pole: np.ndarray,
     half: tuple[float, float],
     middle: tuple[float, float],
-    material: int,
     tint: np.ndarray,
     static_carrier: int,
 ) -> Batch:
@@ -745,7 +744,7 @@ def _box_posts(
         stack_columns(centre, half[0]),
         b=(0.0, 0.0, 0.0, 1.0),
         c=stack_columns(half[1], 0.5 * (end - start)[:, 2], tint[:, 0] * 17.0 % 7.0, 0.0),
-        material=material,
+        material=int(materials.POST),
         tint=tint,
         organ=int(Organ.POLE),
         label=label(Organ.POLE, 0) + model.fixed_index[pole],
@@ -759,7 +758,7 @@ def _concrete_posts(
 ) -> list[Batch]:
     half = float(model.fixed_radius[pole].mean()) - 0.003
     tint = np.array(CONCRETE_TINT) * tone
-    return [_box_posts(model, pole, (half, half), (0.0, 0.0), int(materials.POST), tint, static_carrier)]
+    return [_box_posts(model, pole, (half, half), (0.0, 0.0), tint, static_carrier)]
 
 
 def _steel_posts(
@@ -768,15 +767,10 @@ def _steel_posts(
     rusty = shade % 3 == 0
     tint = np.where(rusty[:, None], STEEL_TINTS[1], STEEL_TINTS[0]) * tone
     wide = float(model.fixed_radius[pole].mean())
-    parts = []
-    for mine, material in ((~rusty, int(materials.METAL)), (rusty, int(materials.POST))):
-        if not mine.any():
-            continue
-        # a web with two flanges, open to the side
-        boxes = [
-            ((wide, 0.0015), (0.0, -0.6 * wide)),
-            ((0.0015, 0.6 * wide), (-wide, 0.0)),
-            ((0.0015, 0.6 * wide), (wide, 0.0)),
-        ]
-        parts += [_box_posts(model, pole[mine], *box, material, tint[mine], static_carrier) for box in boxes]
-    return parts
+    # a web with two flanges, open to the side
+    boxes = [
+        ((wide, 0.0015), (0.0, -0.6 * wide)),
+        ((0.0015, 0.6 * wide), (-wide, 0.0)),
+        ((0.0015, 0.6 * wide), (wide, 0.0)),
+    ]
+    return [_box_posts(model, pole, *box, tint, static_carrier) for box in boxes]
