@@ -71,6 +71,9 @@ def parse_object_name(name: str) -> int | None:
 LABEL_STRIDE = 1 << 20
 """Factor of the organ in a pixel of a label image. The pixel is one int32, ``organ * LABEL_STRIDE + index``."""
 
+NO_OBJECT = LABEL_STRIDE - 1
+"""Index in the labels of parts that belong to no object: a leaf of no tree, a band around no wire."""
+
 
 def label(organ: Organ, index: int) -> int:
     """Returns the label of one object in a label image. ``index`` counts bunches, boxes, trees or actors from 0."""

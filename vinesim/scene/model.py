@@ -20,6 +20,7 @@ import numpy as np
 from vinesim.core import frames
 from vinesim.core.array_fields import StructOfArrays, array
 from vinesim.scene.ids import Organ
+from vinesim.scene.spec import Clutter
 from vinesim.scene.terrain import Terrain
 
 _UNIT_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
@@ -144,10 +145,16 @@ class Model(StructOfArrays):
 
     terrain: Terrain | None = None
     """The uneven ground; None: the plane z = 0."""
+    clutter: Clutter | None = None
+    """What is seen beside the plants; None: nothing. Old wood that can be touched is in the arrays."""
+    clutter_seed: int = 0
+    """Seed of the clutter: the scene's."""
 
     def copy(self) -> Model:
-        """Returns a deep copy of the arrays, with the same terrain."""
-        return dataclasses.replace(super().copy(), terrain=self.terrain)
+        """Returns a deep copy of the arrays, with the same terrain and clutter."""
+        return dataclasses.replace(
+            super().copy(), terrain=self.terrain, clutter=self.clutter, clutter_seed=self.clutter_seed
+        )
 
     def digest(self) -> str:
         """Returns a hash of all arrays (16 hex digits): two clients with equal digests hold the same vineyard."""
@@ -157,6 +164,8 @@ class Model(StructOfArrays):
         if self.terrain is not None:
             h.update(repr((self.terrain.origin, self.terrain.cell, self.terrain.slope)).encode())
             h.update(self.terrain.residual.tobytes())
+        if self.clutter is not None:
+            h.update(repr((self.clutter, self.clutter_seed)).encode())
         return h.hexdigest()
 
     def bodies_of(self, tree: int) -> slice:

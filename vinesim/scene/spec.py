@@ -109,6 +109,35 @@ class Season(_Part, frozen=True, kw_only=True):
     """Share of the leaves that are yellow."""
 
 
+class Clutter(_Part, frozen=True, kw_only=True):
+    """Old wood, and things that stand, hang and lie about in a vineyard. The defaults are a tidy vineyard of young
+    vines.
+
+    Old wood, stubs and posts can be touched. All else is only seen, by cameras and lidars.
+    """
+
+    old_wood: Share = 0.0
+    """How gnarled trunks and arms are: bends, burls, spur heads with stubs of old cuts, peeling bark."""
+    tendrils: Share = 0.0
+    """Tendrils at the nodes of shoots and around wires; 1: at one node of eight."""
+    dead_leaves: Share = 0.0
+    """Brown curled leaves in the canopy and on wires; 1: one for every twelve leaves."""
+    straw: Share = 0.0
+    """Dry mown grass on the ground; 1: covers most of it."""
+    prunings: Share = 0.0
+    """Cut canes on the ground; 1: four on a square metre."""
+    hose: Share = 0.0
+    """Share of the rows with a drip hose."""
+    posts: Literal["plain", "wood", "concrete", "steel", "mixed"] = "plain"
+    """Kind of the posts: round grey ones (plain), round wooden ones, square concrete ones, steel profiles, or each row
+    its own kind (mixed)."""
+    ties: Share = 0.0
+    """Plastic bands around arms, and around shoots at wires; 1: six on an arm, and one at every fourth tied place."""
+    distant_rows: Share = 0.0
+    """Rows of vines beyond the scene's own up to 60 m away, and trees behind them; 1: in every direction. Below 1 a
+    share of the four sides is left open."""
+
+
 class Fruit(_Part, frozen=True, kw_only=True):
     """Bunches on the vines."""
 
@@ -230,6 +259,7 @@ class Scene(_Part, frozen=True, kw_only=True):
     terrain: TerrainTable | None = None
     """Uneven ground; the plane z = 0 unless given."""
     season: Season = Season()
+    clutter: Clutter = Clutter()
     fruit: Fruit
     boxes: tuple[Box, ...] = ()
     imported: tuple[Imported, ...] = ()

@@ -26,6 +26,7 @@ METAL = wp.constant(14)
 STRAW = wp.constant(15)
 REFLEX = wp.constant(16)
 GLASS = wp.constant(17)
+OLD_BARK = wp.constant(18)
 
 
 @wp.struct

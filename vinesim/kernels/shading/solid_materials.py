@@ -10,6 +10,7 @@ from vinesim.kernels.shading.materials import (
     GLASS,
     LAMP,
     METAL,
+    OLD_BARK,
     PAINT,
     PLASTIC,
     POST,
@@ -163,6 +164,24 @@ def woody_surface(
         s.occlusion = 0.6 + 0.4 * smoothstep(0.3, 0.55, height)
         s.normal = wp.normalize(n + wp.vec3(wide[2] - 0.5, fine[1] - 0.5, (wide[3] - 0.5) * 0.3) * 1.0)
         s.specular = 0.01
+    elif material == OLD_BARK:  # long deep fissures between fibrous ridges, with grey patches
+        wide = sample_bilinear(
+            materials.noise_texture, grain[0] * 5.2 + grain[2] * 0.42 + seed, grain[1] * 5.2 - grain[2] * 0.26 + seed
+        )
+        fine = sample_bilinear(
+            materials.noise_texture, grain[0] * 10.0 + grain[2] * 0.8 - seed, grain[1] * 10.0 + grain[2] * 0.55
+        )
+        clear = 1.0 / (1.0 + pixel * 250.0)
+        height = 0.5 + ((wide[2] * 0.62 + wide[1] * 0.16 + fine[2] * 0.22) - 0.5) * clear
+        ridge = smoothstep(0.36, 0.62, height)
+        s.albedo = tint * (0.34 + 0.95 * ridge)
+        grey = 0.5 * smoothstep(0.50, 0.72, wide[0]) * ridge
+        s.albedo = mix(s.albedo, wp.vec3(0.155, 0.150, 0.138), grey)
+        s.occlusion = 0.40 + 0.60 * smoothstep(0.33, 0.52, height)
+        s.normal = wp.normalize(
+            n + wp.vec3(wide[2] - 0.5 + 0.6 * (fine[3] - 0.5), fine[2] - 0.5, 0.7 * (wide[3] - 0.5)) * (2.2 * clear)
+        )
+        s.specular = 0.008
     elif material == POST:
         wide = sample_bilinear(materials.noise_texture, grain[0] * 1.7 + grain[1] * 1.3 + seed, grain[2] * 0.35)
         fine = sample_nearest(materials.noise_texture, grain[0] * 6.0 + grain[1] * 5.0, grain[2] * 0.9 + seed)
@@ -246,7 +265,7 @@ def solid_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: fl
     material = materials.material[i]
     seed = g.c[i][1]
     s = diffuse_surface(o.normal, materials.tint[i], o.sky)
-    if material == CANE or material == BARK or material == POST:
+    if material == CANE or material == BARK or material == POST or material == OLD_BARK:
         s = woody_surface(materials, s, material, o.grain, seed, p, pixel)
     else:
         s = made_surface(materials, s, material, o.grain, seed, pixel)

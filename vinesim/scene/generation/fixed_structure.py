@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 
 from vinesim.scene import builder
+from vinesim.scene.generation.gnarl import POST_RADIUS, gnarled_arms, gnarled_trunks, post_kinds
 from vinesim.scene.generation.shoot_slots import ARM_SEGMENTS, TRUNK_SEGMENTS
 from vinesim.scene.ids import Organ
 from vinesim.scene.plant_parameters import VineParameters
@@ -21,11 +22,17 @@ class FixedStructure:
     """[vine, 3] m, position of the trunk's base on the ground."""
     row: np.ndarray
     """[vine] index of the vine's row."""
+    place: np.ndarray
+    """[vine] index of the vine in its row."""
     rngs: list[np.random.Generator]
     arms: np.ndarray
     """[vine, arm, point, 3] m, points along the axis of each arm."""
     trunk: np.ndarray
     """[vine, point, 3] m, points along the axis of each trunk."""
+    arm_radius: np.ndarray
+    """[vine, arm, point] m"""
+    trunk_radius: np.ndarray
+    """[vine, point] m"""
     fixed: dict[str, np.ndarray]
 
 
@@ -34,6 +41,7 @@ def build_fixed_structure(scene: Scene, parameters: VineParameters) -> FixedStru
     tendone = scene.training == "tendone"
     row, place = (a.ravel() for a in np.mgrid[0 : layout.rows, 0 : layout.vines])
     pole = np.stack([place * layout.vine_spacing, row * layout.row_spacing, 0.0 * row], -1)
+    pole_row = row
     there = [one not in layout.missing for one in zip(row.tolist(), place.tolist(), strict=True)]
     row = row[there]
     place = place[there]
@@ -66,29 +74,36 @@ def build_fixed_structure(scene: Scene, parameters: VineParameters) -> FixedStru
     thick = 0.5 * parameters.trunk.diameter.at(up[:, 0])
     thin = 0.5 * parameters.arm.diameter.at(along[:, 0])
     count = len(foot)
-    radius = 0.5 * parameters.trellis.pole_diameter.value
+    arm_radius = np.broadcast_to(thin, arms.shape[:3])
+    trunk_radius = np.broadcast_to(thick, trunk.shape[:2])
+    if scene.clutter.old_wood > 0.0:
+        trunk, trunk_radius = gnarled_trunks(scene, row, place, trunk, trunk_radius)
+        arms, arm_radius = gnarled_arms(scene, row, place, arms, arm_radius, trunk[:, -1])
+    radius = np.full((len(pole), 2), 0.5 * parameters.trellis.pole_diameter.value)
+    for kind, thickness in POST_RADIUS.items():
+        radius[post_kinds(scene.clutter, scene.seed, pole_row) == kind] = thickness
     pieces = [
-        _cone_chains(trunk, thick, Organ.TRUNK, np.arange(count)),
-        _cone_chains(
-            arms.reshape(-1, ARM_SEGMENTS + 1, 3),
-            thin,
+        cone_chains(trunk, trunk_radius, Organ.TRUNK, np.arange(count)),
+        cone_chains(
+            arms.reshape(-1, *arms.shape[2:]),
+            arm_radius.reshape(-1, arms.shape[2]),
             Organ.ARM,
             np.arange(count * arm_count),
             shear_modulus=builder.shear_modulus(parameters.cane.woody_modulus.value),
         ),
-        _cone_chains(
+        cone_chains(
             pole[:, None] + np.array([[0, 0, -0.3], [0, 0, layout.height + (0.1 if tendone else 1.15)]]),
-            np.array([radius, radius]),
+            radius,
             Organ.POLE,
             np.arange(len(pole)),
         ),
         *_wires(scene, parameters),
     ]
     fixed = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
-    return FixedStructure(foot, row, rngs, arms, trunk, fixed)
+    return FixedStructure(foot, row, place, rngs, arms, trunk, arm_radius, trunk_radius, fixed)
 
 
-def _cone_chains(
+def cone_chains(
     points: np.ndarray,
     radius: np.ndarray,
     organ: Organ,
@@ -96,9 +111,10 @@ def _cone_chains(
     tension: float = 0.0,
     shear_modulus: float = 0.0,
 ) -> dict[str, np.ndarray]:
-    """Returns the ``fixed_`` arrays of round cones along polylines [chain, point, 3] m."""
+    """Returns the ``fixed_`` arrays of round cones along polylines ``points`` [chain, point, 3] m with ``radius``
+    [point] or [chain, point] m."""
     pieces = points.shape[1] - 1
-    pairs = np.broadcast_to(np.stack([radius[:-1], radius[1:]], -1), (len(points), pieces, 2))
+    pairs = np.broadcast_to(np.stack([radius[..., :-1], radius[..., 1:]], -1), (len(points), pieces, 2))
     return {
         "fixed_start": points[:, :-1].reshape(-1, 3),
         "fixed_end": points[:, 1:].reshape(-1, 3),
@@ -142,6 +158,6 @@ def _wires(scene: Scene, parameters: VineParameters) -> list[dict[str, np.ndarra
     for line in lines:
         number = first + np.arange(len(line))
         thickness = np.full(line.shape[1], radius)
-        pieces.append(_cone_chains(line, thickness, Organ.WIRE, number, trellis.wire_tension.value))
+        pieces.append(cone_chains(line, thickness, Organ.WIRE, number, trellis.wire_tension.value))
         first += len(line)
     return pieces

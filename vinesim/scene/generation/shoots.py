@@ -11,8 +11,8 @@ from vinesim.core import frames, portable_math
 from vinesim.scene import builder
 from vinesim.scene.generation.fixed_structure import FixedStructure
 from vinesim.scene.generation.fruit import choose_bunches, sample_fruit
+from vinesim.scene.generation.old_wood import seat_on_spurs
 from vinesim.scene.generation.shoot_slots import (
-    ARM_SEGMENTS,
     AXIS_SEGMENTS,
     LATERAL_NODES,
     LATERAL_SEGMENTS,
@@ -71,6 +71,7 @@ def sample_shoots(scene: Scene, parameters: VineParameters, structure: FixedStru
     cane = parameters.cane
     each = int((parameters.arm.tendone_shoots if tendone else parameters.arm.vsp_shoots).value)
     arm_count = structure.arms.shape[1]
+    arm_segments = structure.arms.shape[2] - 1
     per_vine = each * arm_count
     vines = len(structure.foot)
     count = per_vine * vines
@@ -84,11 +85,17 @@ def sample_shoots(scene: Scene, parameters: VineParameters, structure: FixedStru
     # bases of shoots on their arm: evenly spaced with a small random offset, on alternating sides
     number = np.tile(np.arange(each), arm_count * vines)
     share = 0.17 + 0.81 * (number + 0.2 + 0.6 * uniform()) / each
-    where = share * ARM_SEGMENTS
-    piece = np.minimum(where.astype(int), ARM_SEGMENTS - 1)
-    arm = structure.arms.reshape(vines * arm_count, ARM_SEGMENTS + 1, 3)[np.repeat(np.arange(vines * arm_count), each)]
+    seat = None
+    if scene.clutter.old_wood > 0.0:
+        seat = seat_on_spurs(scene, structure, each)
+        share = seat.share
+    where = share * arm_segments
+    piece = np.minimum(where.astype(int), arm_segments - 1)
+    arm = structure.arms.reshape(vines * arm_count, arm_segments + 1, 3)[np.repeat(np.arange(vines * arm_count), each)]
     rows = np.arange(count)
     start = arm[rows, piece] + (arm[rows, piece + 1] - arm[rows, piece]) * (where - piece)[:, None]
+    if seat is not None:
+        start = start + seat.offset
     along = frames.normalize((arm[:, -1] - arm[:, 0]) * [1.0, 1.0, 0.0])
 
     length = cane.length.at(uniform())
@@ -125,7 +132,7 @@ def sample_shoots(scene: Scene, parameters: VineParameters, structure: FixedStru
     leaf_uniform = np.moveaxis(uniform(MAX_NODES + LATERAL_NODES, 4), -1, 0)
     return Shoots(
         vine=owner,
-        piece=np.repeat(np.arange(vines * arm_count), each) * ARM_SEGMENTS + piece,
+        piece=np.repeat(np.arange(vines * arm_count), each) * arm_segments + piece,
         up=up,
         points=points,
         length=length,

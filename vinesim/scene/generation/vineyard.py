@@ -16,6 +16,7 @@ import numpy as np
 from vinesim.core import array_fields, disk_cache, frames, portable_math
 from vinesim.scene import berries, builder, leaves, plant_parameters
 from vinesim.scene.generation.fixed_structure import FixedStructure, build_fixed_structure
+from vinesim.scene.generation.old_wood import with_old_wood
 from vinesim.scene.generation.plant_bodies import Bodies, build_bodies, place_leaves
 from vinesim.scene.generation.shoot_slots import CORE_SLOTS, MAX_BUNCHES, cluster_slots, peduncle_slots
 from vinesim.scene.generation.shoots import Shoots, sample_shoots
@@ -34,7 +35,7 @@ from vinesim.scene.plant_import.imported_plant import load_imported_plant
 from vinesim.scene.plant_import.ties import tie_to_wires
 from vinesim.scene.plant_import.wood import build_model, join_models
 from vinesim.scene.plant_parameters import VineParameters
-from vinesim.scene.spec import Datum, Scene, Sun, Wind
+from vinesim.scene.spec import Clutter, Datum, Scene, Sun, Wind
 from vinesim.scene.terrain import Terrain, ground_height
 
 
@@ -63,6 +64,7 @@ def generate(scene: Scene) -> Model:
         physics=PhysicsParameters(),
         plants="",
         imported=(),
+        clutter=Clutter(old_wood=scene.clutter.old_wood, posts=scene.clutter.posts),
     )
     if terrain is not None:  # the path of an image must not change the digest, but its content must
         plants = msgspec.structs.replace(plants, terrain=None)
@@ -71,12 +73,21 @@ def generate(scene: Scene) -> Model:
     )
     imported = [(load_imported_plant(one.file), msgspec.structs.replace(one, file="")) for one in scene.imported]
     digest = disk_cache.source_digest(_code_digest(), msgspec.json.encode((plants, parameters, imported, ground)))
-    return Model(terrain=terrain, **disk_cache.load_or_make("vineyard", digest, make)).check()
+    clutter, seed = _clutter_of(scene)
+    arrays = disk_cache.load_or_make("vineyard", digest, make)
+    return Model(terrain=terrain, clutter=clutter, clutter_seed=seed, **arrays).check()
 
 
 def generate_uncached(scene: Scene) -> Model:
     """Returns the same model as :func:`generate` without using the cache. For scenes that are needed only once."""
-    return _generate(scene, plant_parameters.load_plant(scene.plants), build_terrain(scene))
+    model = _generate(scene, plant_parameters.load_plant(scene.plants), build_terrain(scene))
+    model.clutter, model.clutter_seed = _clutter_of(scene)
+    return model
+
+
+def _clutter_of(scene: Scene) -> tuple[Clutter | None, int]:
+    """Returns the clutter of the scene's model and its seed; None and 0 if the scene has no clutter."""
+    return (scene.clutter, scene.seed) if scene.clutter != Clutter() else (None, 0)
 
 
 @functools.cache
@@ -99,6 +110,7 @@ def _generate(scene: Scene, parameters: VineParameters, terrain: Terrain | None)
         level = bodies
         bodies = build_bodies(parameters, shoots)
         ties = raise_ties(ties, shoots, level, bodies)
+    structure = with_old_wood(scene, structure, shoots.points[:, 0])
     leaf = place_leaves(scene, parameters, shoots, bodies)
     model = _assemble_model(scene, parameters, structure, shoots, bodies, leaf, ties)
     if terrain is not None:

@@ -79,6 +79,7 @@ _OF_MATERIAL = {
     materials.STRAW: "straw",
     materials.REFLEX: "metal",
     materials.GLASS: "metal",
+    materials.OLD_BARK: "wood",
 }
 _SURFACE_OF_MATERIAL = np.array([SURFACES.index(_OF_MATERIAL[kind]) for kind in sorted(_OF_MATERIAL)])
 _SECOND = {"leaf": "leaf_dry", "berry_green": "berry_dark", "soil": "grass"}

@@ -18,13 +18,15 @@ from vinesim.core import disk_cache, frames
 from vinesim.kernels.raster import ground, primitives, transform_primitives
 from vinesim.kernels.shading import materials
 from vinesim.scene import berries
-from vinesim.scene.ids import Organ
+from vinesim.scene.ids import LABEL_STRIDE, NO_OBJECT, Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 from vinesim.scene.terrain import Terrain
 from vinesim.scene.values import RigidVisual, Shape, Snapshot
 from vinesim.sensors.primitives import textures
 from vinesim.sensors.primitives.bunch_primitives import Ripeness, bunch_batches, bunch_bodies
+from vinesim.sensors.primitives.clutter import clutter_batches
+from vinesim.sensors.primitives.distant_rows import distant_batches, shaded_extent
 from vinesim.sensors.primitives.leaf_area_density import LeafDensity
 from vinesim.sensors.primitives.plant_primitives import cane_batch, leaf_batches
 from vinesim.sensors.primitives.primitive_batches import Batch, placeholder_batch
@@ -189,21 +191,26 @@ class Primitives:
         self._open(baked)
         self._pose(np.arange(len(self.cluster_first)))
 
-        low = low - 3.0
-        high = high + 3.0
         posed = self.shapes.a.numpy()
         kind = self.shapes.kind.numpy()
         blades = posed[(layout.organ == int(Organ.LEAF)) & (kind == LEAF)]
-        canopy = LeafDensity(blades, low, high, self.device, self.model.terrain)
+        canopy = LeafDensity(blades, low - 3.0, high + 3.0, self.device, self.model.terrain)
         # cones also store the visible sky at their far end, so that light is continuous from segment to segment
         wood = np.flatnonzero(kind == CONE)
         far = canopy.visible_sky(self.shapes.b.numpy()[wood, :3])
         baked["c"][wood, 2:] = np.stack([far, np.ones(len(wood))], 1)
         baked["sky"] = canopy.visible_sky(posed[:, :3])
+        low, high = shaded_extent(self.model, low, high)
         step = _ground_step(low, high)
         x, y = np.meshgrid(np.arange(low[0], high[0], step), np.arange(low[1], high[1], step))
         height = 0.05 if self.model.terrain is None else self.model.terrain.height(x.ravel(), y.ravel()) + 0.05
-        sky = canopy.visible_sky(np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], 1))
+        soil = np.stack([x.ravel(), y.ravel(), np.zeros(x.size) + height], 1)
+        sky = canopy.visible_sky(soil)
+        distant = np.flatnonzero(layout.label % LABEL_STRIDE == NO_OBJECT)
+        if len(distant):
+            around = LeafDensity(blades, low, high, self.device, self.model.terrain)
+            baked["sky"][distant] = around.visible_sky(posed[distant, :3])
+            sky = np.minimum(sky, around.visible_sky(soil))
         baked["ground_sky"] = sky.reshape(x.shape)
         return baked
 
@@ -216,6 +223,7 @@ class Primitives:
         every = np.arange(len(model.bunch_body))
         pieces = [bunch_bodies(model, int(bunch)) for bunch in every]
         batches += bunch_batches(model, every, None, pieces, model.body_tree[model.bunch_body], self._ripeness)
+        batches += clutter_batches(model, self._wires, static, low, high) + distant_batches(model, static)
         around = [*trellis_batches(model, static), wire_batch(model, self._wires, self._bodies, len(model.tree_first))]
         if grass > 0.0:
             age = float(model.leaf_age.mean()) if len(model.leaf_age) else 0.0
@@ -229,9 +237,7 @@ class Primitives:
 
         ``baked``: arrays that were just computed or read from the disk cache.
         """
-        low, high = _ground_extent(self.model)
-        low = low - 3.0
-        high = high + 3.0
+        low, high = shaded_extent(self.model, *_ground_extent(self.model))
         self._textures.ground_sky = wp.array(baked["ground_sky"], dtype=float, device=self.device)
         self._textures.ground_x = float(low[0])
         self._textures.ground_y = float(low[1])

@@ -11,6 +11,7 @@ from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.terrain import Terrain, ground_height
 from vinesim.sensors.primitives import textures
+from vinesim.sensors.primitives.clutter import redrawn_posts, with_old_bark
 from vinesim.sensors.primitives.primitive_batches import Batch, make_batch, stack_columns
 from vinesim.sensors.raster.primitive_arrays import CONE, LEAF
 from vinesim.wires.wire_segments import WireSegments, cut
@@ -37,7 +38,7 @@ def _ground_cells(position: np.ndarray, first: int) -> np.ndarray:
 def trellis_batches(model: Model, static_carrier: int) -> list[Batch]:
     """Returns the primitives of trellis and wood that never move; :func:`wire_batch` makes those of wires under
     tension."""
-    still = np.flatnonzero(model.fixed_tension <= 0.0)
+    still = np.flatnonzero((model.fixed_tension <= 0.0) & ~redrawn_posts(model))
     if not len(still):
         return []
     # long pieces are cut: the bounding box of a whole one would contain half of the vineyard
@@ -78,6 +79,7 @@ def _cones(model: Model, piece: np.ndarray, begin: np.ndarray, stop: np.ndarray)
     index = model.fixed_index[piece]
     table = {o: _TRELLIS[Organ(int(o))] for o in np.unique(organ)}
     material, tint = (np.array([table[o][k] for o in organ]) for k in (0, 1))
+    material, tint = with_old_bark(model, material, tint)
     rng = np.random.default_rng(3)
     seed = rng.uniform(size=int(model.fixed_index.max()) + 1)[index] * 7.0
     # texture is continuous from part to part: distances count from the foot of a post, or along a wire
@@ -85,12 +87,23 @@ def _cones(model: Model, piece: np.ndarray, begin: np.ndarray, stop: np.ndarray)
     return {
         "a": stack_columns(start, thick),
         "b": stack_columns(end, thin),
-        "c": stack_columns(np.where(upright, start[:, 2], length * begin), seed, 0.0, 0.0),
+        "c": stack_columns(np.where(upright, start[:, 2], length * begin + _before(model)[piece]), seed, 0.0, 0.0),
         "material": material,
         "tint": tint,
         "organ": organ,
         "label": organ * label(Organ(1), 0) + index,
     }
+
+
+def _before(model: Model) -> np.ndarray:
+    """Returns the distance [fixed] m from the start of an old arm to each of its pieces; 0 for all other pieces."""
+    if model.clutter is None or model.clutter.old_wood == 0.0:
+        return np.zeros(len(model.fixed_start))
+    elastic = model.arm_is_elastic()
+    length = np.where(elastic, np.linalg.norm(model.fixed_end - model.fixed_start, axis=1), 0.0)
+    before = np.cumsum(length) - length
+    _, first, arm = np.unique(np.where(elastic, model.fixed_index, -1), return_index=True, return_inverse=True)
+    return np.where(elastic, before - before[first][arm], 0.0)
 
 
 def row_layout(model: Model) -> tuple[float, float]:

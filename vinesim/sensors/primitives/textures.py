@@ -18,8 +18,10 @@ from vinesim.scene import leaves
 
 GRASS_OUTLINE = leaves.SHAPE_COUNT
 HERB_OUTLINE = leaves.SHAPE_COUNT + 1
-"""Indices of the outlines that are not vine leaves: a tuft of grass (``GRASS_OUTLINE``) and a broad-leaved herb."""
-OUTLINE_COUNT = leaves.SHAPE_COUNT + 2
+CLUMP_OUTLINE = leaves.SHAPE_COUNT + 2
+"""Indices of the outlines that are not vine leaves: a tuft of grass (``GRASS_OUTLINE``), a broad-leaved herb, and a
+clump of many leaves, for plants far away."""
+OUTLINE_COUNT = leaves.SHAPE_COUNT + 3
 TEXTURE_SIZE = 256
 """Number of texels along each side of square textures."""
 _DISTANCE_STEPS = 400.0
@@ -89,6 +91,25 @@ def _grass_mask() -> np.ndarray:
     return mask
 
 
+def _clump_mask() -> np.ndarray:
+    """Returns the finely sampled mask of a clump of vine leaves with gaps between them."""
+    rng = np.random.default_rng(37)
+    side = TEXTURE_SIZE * _SUPERSAMPLING
+    mask = np.zeros((side, side), np.uint8)
+    theta = np.linspace(-np.pi, np.pi, 60)
+    for number in range(22):
+        shape = number % leaves.SHAPE_COUNT
+        angle = 2.4 * number + rng.normal(0.0, 0.3)
+        away = 0.74 * np.sqrt((number + 0.5) / 22.0)
+        edge = leaves.blade_outline(theta, shape) / leaf_scale(shape) * rng.uniform(0.17, 0.26)
+        turn = theta + rng.uniform(0.0, 2.0 * np.pi)
+        x = away * np.sin(angle) + edge * np.sin(turn) * rng.uniform(0.55, 1.0)
+        y = 0.25 + away * np.cos(angle) + edge * np.cos(turn)
+        blade = np.stack([x + 1.0, y + 0.75], 1) * 0.5 * side
+        cv2.fillPoly(mask, [np.round(blade).astype(np.int32)], 1)
+    return mask
+
+
 def leaf_outlines() -> tuple[np.ndarray, np.ndarray]:
     """Returns signed distances to the edge of all leaf outlines [outline, SIDE, SIDE] int8 in 1/400 leaf unit, and
     octagons around the outlines [outline, 8, 2] in leaf units."""
@@ -108,6 +129,7 @@ def _leaf_outlines() -> disk_cache.Arrays:
         table[shape] = _signed_distance(radius < np.interp(theta, knots, edge))
     table[GRASS_OUTLINE] = _signed_distance(_grass_mask())
     table[HERB_OUTLINE] = _signed_distance((u / 0.42) ** 2 + ((v - 0.45) / 0.55) ** 2 < 1.0)
+    table[CLUMP_OUTLINE] = _signed_distance(_clump_mask())
     table = np.clip(table * _DISTANCE_STEPS, -127, 127).astype(np.int8)
     angle = (np.arange(8) + 0.5) * np.pi / 4.0
     normal = np.stack([np.sin(angle), np.cos(angle)], 1)
@@ -164,6 +186,7 @@ def _leaf_texture() -> disk_cache.Arrays:
     table[GRASS_OUTLINE, ..., 3] = 0.5 + 0.5 * v
     table[HERB_OUTLINE, ..., 0] = 0.6 * np.exp(-((u / 0.03) ** 2))
     table[HERB_OUTLINE, ..., 3] = 0.5
+    table[CLUMP_OUTLINE, ..., 3] = 0.5
     half = table.reshape(OUTLINE_COUNT, TEXTURE_SIZE // 2, 2, TEXTURE_SIZE // 2, 2, 4).mean((2, 4))
     return {"table": np.ascontiguousarray(half, np.float32)}
 

@@ -125,7 +125,7 @@ ${LIGHT_AT_VERTICES}`;
 
 export const MATERIALS = /* glsl */ `
 const uint FOLIAGE = 0u, BERRY = 1u, CANE = 2u, BARK = 3u, POST = 4u, WIRE = 5u, STEM = 6u, PLASTIC = 7u, CLOTH = 8u;
-const uint SKIN = 9u, PAINT = 10u, GRASS = 11u, LAMP = 12u, RUBBER = 13u, METAL = 14u, STRAW = 15u, REFLEX = 16u, GLASS = 17u;
+const uint SKIN = 9u, PAINT = 10u, GRASS = 11u, LAMP = 12u, RUBBER = 13u, METAL = 14u, STRAW = 15u, REFLEX = 16u, GLASS = 17u, OLD_BARK = 18u;
 `;
 
 /** Berries: local is seed, depth in the bunch, and position along the axis; neighbours is the light that others block. */
@@ -269,7 +269,7 @@ export const SOLIDS = /* glsl */ `
 #ifdef PLAIN
 // Wood and manufactured objects with one noise for all materials.
 void grained(inout Surface s, uint material, vec3 grain, float seed, float height) {
-  bool isCane = material == CANE, isBark = material == BARK, isPost = material == POST;
+  bool isCane = material == CANE, isBark = material == BARK, isPost = material == POST || material == OLD_BARK;
   bool isWood = isCane || isBark || isPost, isShiny = material == WIRE || material == METAL;
   bool isGlossy = material == PLASTIC || material == PAINT || material == GLASS || material == REFLEX;
   vec3 scale = isCane ? vec3(9.0, 7.0, 1.6) : isBark ? vec3(4.0, 4.0, 0.4) : vec3(1.7, 1.3, 0.5);
@@ -343,7 +343,7 @@ Surface solid(vec3 n, vec3 tint, float sky, uint material, vec3 grain, float see
 #ifdef PLAIN
   grained(s, material, grain, seed, height);
 #else
-  if (material == CANE || material == BARK || material == POST) wood(s, material, grain, seed, height);
+  if (material == CANE || material == BARK || material == POST || material == OLD_BARK) wood(s, material, grain, seed, height);
   else made(s, material, grain, seed);
 #endif
   if (material != WIRE) s.occlusion *= 0.55 + 0.45 * smoothstep(0.0, 0.35, height + max(n.z, 0.0) * 0.35);
