@@ -241,7 +241,7 @@ def _hang(
         body, float(stalk.length.at(0.5)), (thick, thick), material, _PEDUNCLE_SEGMENTS, organ=Organ.PEDUNCLE, rest=down
     )[-1]
     fruit = mass * (1.0 - parameters.bunch.stem_share.value) / berries.VARIETIES[variety].mass
-    count = int(np.clip(round(fruit), 1, berries.PROTOTYPE_BERRIES[-1]))
+    count = int(np.clip(round(fruit), 1, berries.most_berries(variety)))
     tree.add_bunch(
         last,
         mass,
