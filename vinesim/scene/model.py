@@ -26,6 +26,19 @@ _UNIT_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 _UNIT_QUAT = (0.0, 0.0, 0.0, 1.0)
 
 
+@dataclasses.dataclass(frozen=True, slots=True)
+class FruitLook:
+    """What is visible of the state of the fruit; see :class:`vinesim.scene.spec.Fruit`."""
+
+    ripeness: tuple[float, float] | None
+    """Least and greatest ripeness of a bunch; None: not given."""
+    rot: float
+    shrivelled: float
+    sunburn: float
+    seed: int
+    """Seed of the random differences between bunches and berries."""
+
+
 @dataclasses.dataclass
 class Model(StructOfArrays):
     """Constants of a vineyard. The field declarations contain units and shapes; the module docstring explains the
@@ -144,10 +157,12 @@ class Model(StructOfArrays):
 
     terrain: Terrain | None = None
     """The uneven ground; None: the plane z = 0."""
+    fruit_look: FruitLook | None = None
+    """Visible state of the fruit; None: all fruit is ripe and sound. It is not part of the digest."""
 
     def copy(self) -> Model:
-        """Returns a deep copy of the arrays, with the same terrain."""
-        return dataclasses.replace(super().copy(), terrain=self.terrain)
+        """Returns a deep copy of the arrays, with the same terrain and look of the fruit."""
+        return dataclasses.replace(super().copy(), terrain=self.terrain, fruit_look=self.fruit_look)
 
     def digest(self) -> str:
         """Returns a hash of all arrays (16 hex digits): two clients with equal digests hold the same vineyard."""

@@ -348,11 +348,15 @@ def berry_light(
     sky = materials.sky[number]
     seed = tables.c[number, 0]
     neighbours = tables.d[number, 3] + wp.dot(row3(tables.d, number), n)
-    occlusion = wp.clamp(1.0 - neighbours, 0.12, 1.0) * (0.4 + 0.6 * tables.c[number, 1])
+    rot = tables.c[number, 2]
+    dry = wp.max(tables.c[number, 3], 0.0)
+    burnt = wp.max(-tables.c[number, 3], 0.0)
     pale = wp.clamp(tint[1] * 2.2, 0.0, 1.0)
+    occlusion = wp.clamp(1.0 - neighbours, 0.12 + 0.2 * pale, 1.0) * (0.4 + 0.6 * tables.c[number, 1])
     red = wp.clamp((tint[0] - tint[1]) * 4.0, 0.0, 1.0) * (1.0 - pale)
     wrap = wp.vec3(0.12, 0.06, 0.08) + wp.vec3(0.33, 0.34, 0.12) * pale + wp.vec3(0.2, 0.05, 0.02) * red
-    transmission = wp.vec3(0.95, 0.76, 0.12) * pale + wp.vec3(0.26, 0.03, 0.012) * red + wp.vec3(0.03, 0.003, 0.004)
+    transmission = tint * (1.8 * (1.0 - rot)) * pale
+    transmission += wp.vec3(0.26, 0.03, 0.012) * red + wp.vec3(0.03, 0.003, 0.004)
     bloom = 0.46 - 0.32 * pale - 0.10 * red
     near = wp.where(z * 2.0 / lens.fx < radius * 0.35, 1.0, 0.0)
     w = unit(e)
@@ -362,21 +366,30 @@ def berry_light(
     t = texels_around(w[0] * 1.1 + w[2] * 0.6 + seed, w[1] * 1.1 - w[2] * 0.4)
     fine = sampled(tables.noise, t, 1)
     albedo = tint * (0.86 + 0.28 * wide1)
-    albedo = mix(albedo, wp.vec3(0.46, 0.30, 0.06), pale * 0.35 * smoothstep(0.5, 0.8, wide0 + 0.15 * n[2]))
-    speck = wp.where(sampled(tables.noise, t, 3) > 0.82, 0.22, 0.0)
-    albedo = albedo * (1.0 + pale * (0.14 * sampled(tables.noise, t, 2) - 0.07) + red * speck)
+    amber = pale * 0.35 * wp.clamp(8.0 * (tint[0] / tint[1] - 0.8), 0.0, 1.0)
+    albedo = mix(albedo, wp.vec3(0.46, 0.30, 0.06), amber * smoothstep(0.5, 0.8, wide0 + 0.15 * n[2]))
+    fine2 = sampled(tables.noise, t, 2)
+    fine3 = sampled(tables.noise, t, 3)
+    speck = wp.where(fine3 > 0.82, 0.22, 0.0)
+    albedo = albedo * (1.0 + pale * (0.14 * fine2 - 0.07) + red * speck)
     along = wp.dot(w, axis)
     dusty = bloom * smoothstep(0.30, 0.62, wide0 * 0.55 + wide1 * 0.45 + 0.12 * n[2]) * (0.75 + 0.5 * fine)
     albedo = mix(albedo, wp.vec3(0.07, 0.045, 0.025), smoothstep(0.986, 0.994, along))
     albedo = mix(albedo, wp.vec3(0.16, 0.18, 0.06), 0.7 * smoothstep(-0.95, -0.985, along))
+    burn = burnt * smoothstep(-0.3, 0.5, n[2] + wide0 - 0.5)
+    albedo = mix(albedo, wp.vec3(0.22, 0.11, 0.04), burn)
+    fuzz = wp.where(near > 0.5, smoothstep(0.40, 0.65, fine), 0.4)
     albedo = mix(tint, albedo, near)
-    dusty = wp.where(near > 0.5, dusty, bloom * 0.6)
-    albedo = mix(albedo, wp.vec3(0.40, 0.43, 0.60), wp.clamp(dusty, 0.0, 0.8))
-    shininess = 260.0 - 300.0 * wp.min(dusty, 0.75)
-    reflectivity = 1.0 - wp.min(dusty * 1.6, 0.85)
+    dusty = wp.where(near > 0.5, dusty, bloom * 0.6) * (1.0 - rot) * (1.0 - 0.5 * dry)
+    albedo = mix(albedo, wp.vec3(0.40, 0.43, 0.60) + wp.vec3(0.05, 0.10, -0.20) * pale, wp.clamp(dusty, 0.0, 0.8))
+    albedo = mix(albedo, wp.vec3(0.33, 0.30, 0.25), rot * 0.75 * fuzz)
+    shininess = (110.0 - 120.0 * wp.min(dusty, 0.75)) * (1.0 - 0.8 * rot)
+    reflectivity = 0.6 * (1.0 - wp.min(dusty * 1.6, 0.85)) * (1.0 - rot)
+    plain = n
+    n = unit(n + wp.vec3(fine - 0.5, fine2 - 0.5, fine3 - 0.5) * ((1.6 * dry + 0.8 * rot) * near))
     # light
     ndl = wp.dot(n, light.sun)
-    lit = sun_share(maps, p, n * wp.where(ndl < 0.0, -1.0, 1.0), sky)
+    lit = sun_share(maps, p, plain * wp.where(wp.dot(plain, light.sun) < 0.0, -1.0, 1.0), sky)
     direct = wp.vec3(
         wp.max((ndl + wrap[0]) / (1.0 + wrap[0]), 0.0),
         wp.max((ndl + wrap[1]) / (1.0 + wrap[1]), 0.0),

@@ -28,7 +28,7 @@ from vinesim.scene.generation.uneven_ground import (
     raise_ties,
 )
 from vinesim.scene.ids import Organ
-from vinesim.scene.model import Model
+from vinesim.scene.model import FruitLook, Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.plant_import.imported_plant import load_imported_plant
 from vinesim.scene.plant_import.ties import tie_to_wires
@@ -60,6 +60,7 @@ def generate(scene: Scene) -> Model:
         wind=Wind(),
         datum=Datum(),
         spawns=(),
+        fruit=msgspec.structs.replace(scene.fruit, ripeness=None, rot=0.0, shrivelled=0.0, sunburn=0.0),
         physics=PhysicsParameters(),
         plants="",
         imported=(),
@@ -71,7 +72,8 @@ def generate(scene: Scene) -> Model:
     )
     imported = [(load_imported_plant(one.file), msgspec.structs.replace(one, file="")) for one in scene.imported]
     digest = disk_cache.source_digest(_code_digest(), msgspec.json.encode((plants, parameters, imported, ground)))
-    return Model(terrain=terrain, **disk_cache.load_or_make("vineyard", digest, make)).check()
+    arrays = disk_cache.load_or_make("vineyard", digest, make)
+    return Model(terrain=terrain, fruit_look=_fruit_look(scene), **arrays).check()
 
 
 def generate_uncached(scene: Scene) -> Model:
@@ -85,6 +87,14 @@ def _code_digest() -> str:
     package = pathlib.Path(builder.__file__).parent
     others = [pathlib.Path(str(module.__file__)) for module in (frames, array_fields, portable_math)]
     return disk_cache.source_digest(package, *others, repr(berries.VARIETIES))
+
+
+def _fruit_look(scene: Scene) -> FruitLook | None:
+    """Returns the visible state of the scene's fruit; None if the scene does not describe it."""
+    fruit = scene.fruit
+    if fruit.ripeness is None and not (fruit.rot or fruit.shrivelled or fruit.sunburn):
+        return None
+    return FruitLook(fruit.ripeness, fruit.rot, fruit.shrivelled, fruit.sunburn, scene.seed)
 
 
 def _generate(scene: Scene, parameters: VineParameters, terrain: Terrain | None) -> Model:
@@ -107,6 +117,7 @@ def _generate(scene: Scene, parameters: VineParameters, terrain: Terrain | None)
             half = 0.5 * box.size[0], 0.5 * box.size[1]
             model.box_pose[i] = terrain.resting_pose(box.x, box.y, box.yaw, half)
     model = builder.solve_rest_pose(model).check()
+    model.fruit_look = _fruit_look(scene)
     variety = [v.name for v in berries.VARIETIES].index(scene.fruit.varieties[0])
     for number, one in enumerate(scene.imported):
         foot = one.z + float(ground_height(terrain, one.x, one.y))
