@@ -57,17 +57,17 @@ _SHAPES = ((0.75, 0), (0.45, 1), (0.22, 2))
 conical, shouldered, cylindrical with two wings.
 """
 _WINE_SHAPES = (
-    _Shape(0.85, (), (1.1, 1.4)),
-    _Shape(0.60, (0.10, 0.08), (1.2, 1.5)),
-    _Shape(0.25, (0.17,), (1.5, 1.8)),
-    _Shape(0.45, (0.12,), (1.8, 2.3)),
+    _Shape(0.85, (), (1.3, 1.6)),
+    _Shape(0.60, (0.10, 0.08), (1.4, 1.8)),
+    _Shape(0.25, (0.17,), (1.7, 2.1)),
+    _Shape(0.45, (0.12,), (2.1, 2.7)),
 )
 """Shapes of the prototypes of each count of berries of wine grapes: conical, shouldered, cylindrical with a wing, long.
 """
 _PACKINGS: dict[Style, _Packing] = {
-    "loose": _Packing(fill=0.40, touch=0.985, rest=1.75, ragged=0.45),
-    "medium": _Packing(fill=0.54, touch=0.96, rest=1.55, ragged=0.30),
-    "dense": _Packing(fill=0.68, touch=0.93, rest=1.40, ragged=0.18),
+    "loose": _Packing(fill=0.44, touch=0.985, rest=1.70, ragged=0.45),
+    "medium": _Packing(fill=0.62, touch=0.95, rest=1.45, ragged=0.28),
+    "dense": _Packing(fill=0.82, touch=0.92, rest=1.25, ragged=0.14),
 }
 MAX_OVERLAP = 0.09
 """[1] Largest overlap of two berries of a bunch of wine grapes, as a fraction of the sum of their radii."""

@@ -130,7 +130,7 @@ class Model(StructOfArrays):
     leaf_pose: np.ndarray = array("leaf", 7, unit="m, 1", fill=_UNIT_POSE)
     """Blade frame in the body's frame: origin where petiole meets blade, x along the midrib, z the upper side."""
     leaf_size: np.ndarray = array("leaf", unit="m")
-    """Half of the blade's width; it scales the outline."""
+    """About half of the blade's width; it scales the outline, whose area is ``leaves.BLADE_AREA`` in this unit."""
     leaf_age: np.ndarray = array("leaf", unit="1")
     """Age from 0 (young and green) to 1 (yellow)."""
 
@@ -208,6 +208,13 @@ class Model(StructOfArrays):
             owner[body] = bunch
             body = self.body_parent[body]
         return owner
+
+    def variety_of_trees(self) -> np.ndarray:
+        """[tree] Variety of each tree's vine, as an index into ``vinesim.scene.berries.VARIETIES``: that of the vine's
+        bunches; -1 for a vine without bunches."""
+        vines = np.full(int(self.tree_vine.max(initial=-1)) + 2, -1, np.int32)  # the last entry is for trees of no vine
+        vines[self.tree_vine[self.body_tree[self.bunch_body]]] = self.bunch_variety
+        return vines[self.tree_vine]
 
     def is_on_arm(self) -> np.ndarray:
         """Whether the root of each tree sits on a piece of arm that can twist [tree] bool."""

@@ -357,7 +357,7 @@ def berry_light(
     wrap = wp.vec3(0.12, 0.06, 0.08) + wp.vec3(0.33, 0.34, 0.12) * pale + wp.vec3(0.2, 0.05, 0.02) * red
     transmission = tint * (1.8 * (1.0 - rot)) * pale
     transmission += wp.vec3(0.26, 0.03, 0.012) * red + wp.vec3(0.03, 0.003, 0.004)
-    bloom = 0.46 - 0.32 * pale - 0.10 * red
+    bloom = 0.36 - 0.22 * pale - 0.06 * red
     near = wp.where(z * 2.0 / lens.fx < radius * 0.35, 1.0, 0.0)
     w = unit(e)
     t = texels_around(w[0] * 0.20 + seed * 7.1, w[1] * 0.20 + w[2] * 0.31 + seed * 3.3)
@@ -383,7 +383,7 @@ def berry_light(
     dusty = wp.where(near > 0.5, dusty, bloom * 0.6) * (1.0 - rot) * (1.0 - 0.5 * dry)
     albedo = mix(albedo, wp.vec3(0.40, 0.43, 0.60) + wp.vec3(0.05, 0.10, -0.20) * pale, wp.clamp(dusty, 0.0, 0.8))
     albedo = mix(albedo, wp.vec3(0.33, 0.30, 0.25), rot * 0.75 * fuzz)
-    shininess = (110.0 - 120.0 * wp.min(dusty, 0.75)) * (1.0 - 0.8 * rot)
+    shininess = (70.0 - 72.0 * wp.min(dusty, 0.75)) * (1.0 - 0.8 * rot)
     reflectivity = 0.6 * (1.0 - wp.min(dusty * 1.6, 0.85)) * (1.0 - rot)
     plain = n
     n = unit(n + wp.vec3(fine - 0.5, fine2 - 0.5, fine3 - 0.5) * ((1.6 * dry + 0.8 * rot) * near))

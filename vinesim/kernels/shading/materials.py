@@ -214,7 +214,7 @@ def berry_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: fl
     s.wrap = wp.vec3(0.12, 0.06, 0.08) + wp.vec3(0.33, 0.34, 0.12) * pale + wp.vec3(0.2, 0.05, 0.02) * red
     s.transmission = tint * (1.8 * (1.0 - rot)) * pale
     s.transmission += wp.vec3(0.26, 0.03, 0.012) * red + wp.vec3(0.03, 0.003, 0.004)
-    bloom = 0.46 - 0.32 * pale - 0.10 * red
+    bloom = 0.36 - 0.22 * pale - 0.06 * red
     s.specular = 0.045
     bm = bloom * 0.6
     fuzz = float(0.4)
@@ -242,7 +242,7 @@ def berry_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: fl
     bm = bm * (1.0 - rot) * (1.0 - 0.5 * dry)
     s.albedo = mix(s.albedo, wp.vec3(0.40, 0.43, 0.60) + wp.vec3(0.05, 0.10, -0.20) * pale, wp.clamp(bm, 0.0, 0.8))
     s.albedo = mix(s.albedo, wp.vec3(0.33, 0.30, 0.25), rot * 0.75 * fuzz)
-    s.shininess = (110.0 - 120.0 * wp.min(bm, 0.75)) * (1.0 - 0.8 * rot)
+    s.shininess = (70.0 - 72.0 * wp.min(bm, 0.75)) * (1.0 - 0.8 * rot)
     s.reflectivity = 0.6 * (1.0 - wp.min(bm * 1.6, 0.85)) * (1.0 - rot)
     return s
 

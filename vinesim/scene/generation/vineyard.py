@@ -214,8 +214,7 @@ def _assemble_model(
     model.leaf_base[:] = leaf["base"][shown]
     model.leaf_pose[:] = leaf["pose"][shown]
     model.leaf_age[:] = leaf["age"][shown]
-    blade = np.mean([leaves.blade_area(shape) for shape in range(leaves.SHAPE_COUNT)])
-    model.leaf_size[:] = np.sqrt(leaf["area"][shown] / blade)
+    model.leaf_size[:] = np.sqrt(leaf["area"][shown] / leaves.BLADE_AREA)
 
     for name, value in structure.fixed.items():
         getattr(model, name)[:] = value

@@ -11,7 +11,7 @@ from vinesim.core import frames
 from vinesim.scene import berries, builder
 from vinesim.scene.builder import RodMaterial, TreeBuilder
 from vinesim.scene.ids import Organ
-from vinesim.scene.leaves import LATERAL_AREA, SHAPE_COUNT, LeafNodes, add_point_masses, blade_area, grow_leaves
+from vinesim.scene.leaves import BLADE_AREA, LATERAL_AREA, LeafNodes, add_point_masses, grow_leaves
 from vinesim.scene.model import Model
 from vinesim.scene.plant_import.imported_plant import ImportedPlant, Wood
 from vinesim.scene.plant_parameters import Cane, Leaf, VineParameters
@@ -369,7 +369,7 @@ def add_leaves(
     for b in np.unique(body).tolist():
         parts[b].update(zip(("mass", "com", "inertia"), (part[b] for part in heavy), strict=True))
         parts[b]["drag"] += float(grown["drag"][body == b].sum())
-    size = np.sqrt(grown["area"] / np.mean([blade_area(shape) for shape in range(SHAPE_COUNT)]))
+    size = np.sqrt(grown["area"] / BLADE_AREA)
     for i, b in enumerate(body.tolist()):
         tree.leaves.append(
             {

@@ -137,7 +137,7 @@ Surface berry(vec3 n, vec3 tint, float sky, vec3 local, vec4 neighbours) {
   float red = clamp((tint.x - tint.y) * 4.0, 0.0, 1.0) * (1.0 - pale);
   s.wrap = vec3(0.12, 0.06, 0.08) + vec3(0.33, 0.34, 0.12) * pale + vec3(0.2, 0.05, 0.02) * red;
   s.transmission = tint * 1.8 * pale + vec3(0.26, 0.03, 0.012) * red + vec3(0.03, 0.003, 0.004);
-  float bloom = 0.46 - 0.32 * pale - 0.10 * red, seed = local.x;
+  float bloom = 0.36 - 0.22 * pale - 0.06 * red, seed = local.x;
   vec4 wide = noiseAt(vec2(n.x * 0.20 + seed * 7.1, n.y * 0.20 + n.z * 0.31 + seed * 3.3));
 #ifdef PLAIN
   vec4 fine = wide.zwxy;
@@ -153,7 +153,7 @@ Surface berry(vec3 n, vec3 tint, float sky, vec3 local, vec4 neighbours) {
   s.albedo = mix(s.albedo, vec3(0.16, 0.18, 0.06), 0.7 * (1.0 - smoothstep(-0.985, -0.95, local.z)));
   s.albedo = mix(s.albedo, vec3(0.40, 0.43, 0.60) + vec3(0.05, 0.10, -0.20) * pale, clamp(dusty, 0.0, 0.8));
   s.specular = 0.045;
-  s.shininess = 110.0 - 120.0 * min(dusty, 0.75);
+  s.shininess = 70.0 - 72.0 * min(dusty, 0.75);
   s.reflectivity = 0.6 * (1.0 - min(dusty * 1.6, 0.85));
   return s;
 }
