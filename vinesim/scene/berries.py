@@ -211,11 +211,16 @@ def _scaled(which: int, count: int, length: float, radius: float, variety: int) 
     thin = kind.elongation ** (-1.0 / 3.0)
     near = np.where(unit.neighbours[:count] < count, unit.neighbours[:count], -1)
     order = np.argsort(near < 0, axis=1, kind="stable")
+    rachis = unit.rachis
+    if kind.style != "table":  # branches below the last berry were cut off with their berries
+        inside = rachis[..., 0].max(1) < lengths[which, count] - 1.0
+        inside[0] = True
+        rachis = rachis[inside]
     return BerryLayout(
         position=unit.position[:count] * scale,
         radius=unit.radius[:count] * (scale * thin),
         axis=unit.axis[:count],
         foot=unit.foot[:count] * scale,
-        rachis=unit.rachis * scale,
+        rachis=rachis * scale,
         neighbours=np.take_along_axis(near, order, 1),
     )

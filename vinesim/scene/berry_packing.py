@@ -57,10 +57,10 @@ _SHAPES = ((0.75, 0), (0.45, 1), (0.22, 2))
 conical, shouldered, cylindrical with two wings.
 """
 _WINE_SHAPES = (
-    _Shape(0.85, (), (1.3, 1.6)),
-    _Shape(0.60, (0.10, 0.08), (1.4, 1.8)),
-    _Shape(0.25, (0.17,), (1.7, 2.1)),
-    _Shape(0.45, (0.12,), (2.1, 2.7)),
+    _Shape(0.85, (), (1.6, 2.0)),
+    _Shape(0.60, (0.10, 0.08), (1.7, 2.2)),
+    _Shape(0.25, (0.17,), (2.1, 2.6)),
+    _Shape(0.45, (0.12,), (2.5, 3.1)),
 )
 """Shapes of the prototypes of each count of berries of wine grapes: conical, shouldered, cylindrical with a wing, long.
 """

@@ -240,7 +240,7 @@ def berry_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: fl
         fuzz = smoothstep(0.40, 0.65, fine[1])
         s.normal = wp.normalize(n + wp.vec3(fine[1] - 0.5, fine[2] - 0.5, fine[3] - 0.5) * (1.6 * dry + 0.8 * rot))
     bm = bm * (1.0 - rot) * (1.0 - 0.5 * dry)
-    s.albedo = mix(s.albedo, wp.vec3(0.40, 0.43, 0.60) + wp.vec3(0.05, 0.10, -0.20) * pale, wp.clamp(bm, 0.0, 0.8))
+    s.albedo = mix(s.albedo, wp.vec3(0.40, 0.43, 0.60) + wp.vec3(0.0, 0.04, -0.36) * pale, wp.clamp(bm, 0.0, 0.8))
     s.albedo = mix(s.albedo, wp.vec3(0.33, 0.30, 0.25), rot * 0.75 * fuzz)
     s.shininess = (70.0 - 72.0 * wp.min(bm, 0.75)) * (1.0 - 0.8 * rot)
     s.reflectivity = 0.6 * (1.0 - wp.min(bm * 1.6, 0.85)) * (1.0 - rot)

@@ -151,7 +151,7 @@ Surface berry(vec3 n, vec3 tint, float sky, vec3 local, vec4 neighbours) {
   float dusty = bloom * smoothstep(0.30, 0.62, wide.x * 0.55 + wide.y * 0.45 + 0.12 * n.z) * (0.75 + 0.5 * fine.y);
   s.albedo = mix(s.albedo, vec3(0.07, 0.045, 0.025), smoothstep(0.986, 0.994, local.z));
   s.albedo = mix(s.albedo, vec3(0.16, 0.18, 0.06), 0.7 * (1.0 - smoothstep(-0.985, -0.95, local.z)));
-  s.albedo = mix(s.albedo, vec3(0.40, 0.43, 0.60) + vec3(0.05, 0.10, -0.20) * pale, clamp(dusty, 0.0, 0.8));
+  s.albedo = mix(s.albedo, vec3(0.40, 0.43, 0.60) + vec3(0.0, 0.04, -0.36) * pale, clamp(dusty, 0.0, 0.8));
   s.specular = 0.045;
   s.shininess = 70.0 - 72.0 * min(dusty, 0.75);
   s.reflectivity = 0.6 * (1.0 - min(dusty * 1.6, 0.85));
