@@ -380,7 +380,7 @@ def berry_light(
     albedo = mix(albedo, wp.vec3(0.22, 0.11, 0.04), burn)
     fuzz = wp.where(near > 0.5, smoothstep(0.40, 0.65, fine), 0.4)
     albedo = mix(tint, albedo, near)
-    dusty = wp.where(near > 0.5, dusty, bloom * 0.6) * (1.0 - rot) * (1.0 - 0.5 * dry)
+    dusty = wp.where(near > 0.5, dusty, bloom * 0.45) * (1.0 - rot) * (1.0 - 0.5 * dry)
     albedo = mix(albedo, wp.vec3(0.40, 0.43, 0.60) + wp.vec3(0.0, 0.04, -0.36) * pale, wp.clamp(dusty, 0.0, 0.8))
     albedo = mix(albedo, wp.vec3(0.33, 0.30, 0.25), rot * 0.75 * fuzz)
     shininess = (70.0 - 72.0 * wp.min(dusty, 0.75)) * (1.0 - 0.8 * rot)

@@ -216,7 +216,7 @@ def berry_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: fl
     s.transmission += wp.vec3(0.26, 0.03, 0.012) * red + wp.vec3(0.03, 0.003, 0.004)
     bloom = 0.36 - 0.22 * pale - 0.06 * red
     s.specular = 0.045
-    bm = bloom * 0.6
+    bm = bloom * 0.45
     fuzz = float(0.4)
     if pixel < a4[3] * 0.35:
         w = wp.normalize(e)
