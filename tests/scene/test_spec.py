@@ -66,7 +66,10 @@ ERRORS = {
     "missing table": (('[fruit]\nbunches = [2, 4]\nvarieties = ["italia"]', ""), ["fruit is missing", "add it"]),
     "syntax": (("vines = 2", "vines = = 2"), ["line 8", "correct the syntax"]),
     "choice": (('"tendone"', '"pergola"'), ["training is 'pergola'", "give one of: tendone, vsp"]),
-    "variety": (('["italia"]', '["malbec"]'), ["fruit.varieties[0] is 'malbec'", "italia, redglobe, black, chardonnay"]),
+    "variety": (
+        ('["italia"]', '["malbec"]'),
+        ["fruit.varieties[0] is 'malbec'", "italia, redglobe, black, chardonnay"],
+    ),
     "ripeness falls": (("[2, 4]", "[2, 4]\nripeness = [0.8, 0.2]"), ["fruit.ripeness is [0.8, 0.2]", "rising"]),
     "ripeness above 1": (("[2, 4]", "[2, 4]\nripeness = [0.8, 1.2]"), ["fruit.ripeness", "1.2", "<= 1"]),
     "rot below 0": (("[2, 4]", "[2, 4]\nrot = -0.1"), ["fruit.rot is -0.1", ">= 0"]),

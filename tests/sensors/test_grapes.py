@@ -98,7 +98,9 @@ def test_the_shares_of_damaged_bunches_are_those_of_the_scene() -> None:
     """Rot is a patch of berries near each other; shrivelled berries are smaller; sound berries are untouched."""
     model, sound = vineyard("syrah")
     _, damaged = vineyard("syrah", rot=0.3, shrivelled=0.4, sunburn=0.25)
-    before, after = (one.shapes.a.numpy()[one.shapes.kind.numpy() == SPHEROID].astype(float) for one in (sound, damaged))
+    before, after = (
+        one.shapes.a.numpy()[one.shapes.kind.numpy() == SPHEROID].astype(float) for one in (sound, damaged)
+    )
     berry = damaged.shapes.kind.numpy() == SPHEROID
     bunch = damaged.label[berry] % LABEL_STRIDE
     rot, dryness = damaged.shapes.c.numpy()[berry, 2:].T

@@ -123,9 +123,7 @@ def mass_by_segment(
     share = np.zeros((len(count), most))
     centre, inertia = np.zeros((2, len(count), most, 3))
     for style, here in _by_style(variety):
-        share[here], centre[here], inertia[here] = _mass_by_segment(
-            style, count[here], seed[here], pieces[here], most
-        )
+        share[here], centre[here], inertia[here] = _mass_by_segment(style, count[here], seed[here], pieces[here], most)
     return share, centre, inertia
 
 

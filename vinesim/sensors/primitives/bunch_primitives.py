@@ -32,7 +32,7 @@ _DRY_SIZE = 0.72
 """Size of a shrivelled berry, relative to a sound one [1]: GUESSED."""
 _BUNCH_SPREAD = np.array([0.08, 0.04, 0.10])
 """Standard deviations of the colour of bunches of wine grapes about that of their variety [1]: GUESSED."""
-_CROWDED = 0.42
+_CROWDED = 0.21
 """Mean share of light hidden by neighbours from which on the pedicel of a berry of a wine grape is not drawn: berries
 cover it. GUESSED."""
 _SHOT_BERRY_SHARE = 0.06

@@ -72,7 +72,9 @@ def leaf_batches(model: Model) -> list[Batch]:
     tint = np.array([0.042, 0.115, 0.016]) * (0.75 + 0.6 * young) * (1.0 + 0.10 * rng.normal(size=(count, 1)))
     tint = tint + np.array([0.030, 0.035, 0.0]) * np.clip(0.7 * rng.normal(size=(count, 1)), 0.0, 2.0)
     bend = np.stack([rng.normal(-0.10, 0.16, count), rng.normal(-0.16, 0.14, count), rng.uniform(0.0, 0.45, count)], 1)
-    bend = np.clip(bend * (1.0 + rng.exponential(0.35, (count, 1))), -_MOST_BENT, _MOST_BENT)  # some leaves curl or fold
+    bend = np.clip(
+        bend * (1.0 + rng.exponential(0.35, (count, 1))), -_MOST_BENT, _MOST_BENT
+    )  # some leaves curl or fold
     body = model.leaf_body
     tree = model.body_tree[model.leaf_body]
     names = label(Organ.LEAF, 0) + tree

@@ -507,7 +507,9 @@ def _digest(model: Model, grass: float, device: str) -> str:
     shading = package / "kernels" / "shading"
     code += [shading / "materials.py", shading / "shadow_maps.py"]
     where = device.partition(":")[0]
-    return disk_cache.source_digest(*code, f"{model.digest()} {grass!r} {berries.VARIETIES!r} {model.fruit_look!r}", where)
+    return disk_cache.source_digest(
+        *code, f"{model.digest()} {grass!r} {berries.VARIETIES!r} {model.fruit_look!r}", where
+    )
 
 
 def rest_snapshot(model: Model, visuals: tuple[RigidVisual, ...] = (), visual_q: np.ndarray | None = None) -> Snapshot:
