@@ -1,5 +1,7 @@
 """Leaf outlines: all of one area, five lobes of three depths, small teeth; holes count in the area."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -56,7 +58,7 @@ def test_teeth_are_small_and_many(shape):
     tip = np.flatnonzero((r[1:-1] > r[:-2]) & (r[1:-1] >= r[2:])) + 1
     notch = np.flatnonzero((r[1:-1] < r[:-2]) & (r[1:-1] <= r[2:])) + 1
     assert 25 < len(tip) < 75
-    between = [r[a:b].min() for a, b in zip(tip[:-1], tip[1:], strict=True)]
+    between = [r[a:b].min() for a, b in itertools.pairwise(tip)]
     height = r[tip[:-1]] - np.array(between)
     assert len(notch) > 20
     assert 0.01 < np.median(height) < 0.06

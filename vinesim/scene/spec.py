@@ -117,8 +117,9 @@ class Fruit(_Part, frozen=True, kw_only=True):
     varieties: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
     """Names from :data:`vinesim.scene.berries.VARIETIES`. Row i has variety i modulo their number."""
     ripeness: tuple[Share, Share] | None = None
-    """Least and greatest ripeness of a bunch, 0 (green) to 1 (ripe), between which bunches are uniformly distributed. By
-    default all fruit is ripe, and data sets have bunches of every ripeness. Like the shares below it is visible only."""
+    """Least and greatest ripeness of a bunch, 0 (green) to 1 (ripe), between which bunches are uniformly distributed.
+    By default all fruit is ripe, and data sets have bunches of every ripeness. Ripeness and the shares below change
+    pictures only."""
     rot: Share = 0.0
     """Share of the bunches with a patch of grey mould (botrytis)."""
     shrivelled: Share = 0.0

@@ -11,6 +11,7 @@ import numpy as np
 
 from vinesim.core import frames, portable_math
 from vinesim.scene import builder
+from vinesim.scene.berries import VARIETIES
 from vinesim.scene.generation.shoot_slots import (
     AXIS_SEGMENTS,
     CORE_SLOTS,
@@ -26,7 +27,6 @@ from vinesim.scene.generation.shoot_slots import (
 )
 from vinesim.scene.generation.shoots import Shoots
 from vinesim.scene.ids import Organ
-from vinesim.scene.berries import VARIETIES
 from vinesim.scene.leaves import LATERAL_AREA, LeafNodes, add_point_masses, grow_leaves
 from vinesim.scene.plant_parameters import Cane as CaneParameters
 from vinesim.scene.plant_parameters import Peduncle as PeduncleParameters
