@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from vinesim.scene import berries
+from vinesim.scene import berry_packing
 from vinesim.scene.generation import vineyard
 from vinesim.scene.generation.vineyard import generate, generate_uncached
 from vinesim.scene.model import Model
@@ -77,10 +77,10 @@ def test_a_parameter_of_the_plants_makes_another_model(cache: pathlib.Path, monk
 
 
 def test_cached_berries_are_the_packed_ones() -> None:
-    berries.prototypes.cache_clear()
-    first = berries.prototypes()
-    berries.prototypes.cache_clear()
-    for packed, a, b in zip(berries._pack(), first, berries.prototypes(), strict=True):
+    berry_packing.prototypes.cache_clear()
+    first = berry_packing.prototypes()
+    berry_packing.prototypes.cache_clear()
+    for packed, a, b in zip(berry_packing._pack("table"), first, berry_packing.prototypes(), strict=True):
         for name in ("position", "radius", "axis", "foot", "rachis", "neighbours"):
             bits = {np.ascontiguousarray(getattr(one, name)).tobytes() for one in (packed, a, b)}
             assert len(bits) == 1, name

@@ -116,7 +116,7 @@ def test_the_ray_caster_sees_the_same(scene, where: str) -> None:
     assert len(np.unique(ids)) > 10
     assert same.mean() >= 0.999
     close = same & (truth < 20.0)
-    assert np.quantile(np.abs(depth[close] - truth[close]), 0.9999) < 2e-4  # the rest: leaves seen edge-on
+    assert np.quantile(np.abs(depth[close] - truth[close]), 0.9999) < 3e-4  # the rest: curled leaves seen edge-on
 
 
 def test_the_ray_caster_sees_the_same_from_anywhere(scene) -> None:

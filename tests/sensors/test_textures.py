@@ -11,7 +11,7 @@ def test_outlines_have_the_area_of_the_leaf() -> None:
     table, _ = textures.leaf_outlines()
     for shape in range(leaves.SHAPE_COUNT):
         texels = (table[shape] > 0).sum() * (2.0 / textures.TEXTURE_SIZE) ** 2
-        assert texels * textures.leaf_scale(np.array(shape)) ** 2 == pytest.approx(leaves.blade_area(shape), rel=0.02)
+        assert texels * textures.leaf_scale(np.array(shape)) ** 2 == pytest.approx(leaves.BLADE_AREA, rel=0.02)
 
 
 def test_octagons_hold_their_outlines() -> None:

@@ -86,6 +86,7 @@ def segment_bunches(
     radius: np.ndarray,
     berry_count: np.ndarray,
     seed: np.ndarray,
+    variety: np.ndarray,
     rachis: plant_parameters.Rachis,
     stem_share: float,
 ) -> BunchSegments:
@@ -98,11 +99,12 @@ def segment_bunches(
         radius: [n] m, radius of the hull.
         berry_count: [n] number of berries.
         seed: [n] seed that selects the arrangement of berries among the prototypes of :mod:`vinesim.scene.berries`.
+        variety: [n] index into :data:`vinesim.scene.berries.VARIETIES`.
         rachis: parameters of the stem inside the bunch.
         stem_share: share of the mass that is stem.
     """
     count = np.clip(np.round(length / rachis.piece.value).astype(int), 5, 1 + MAX_CLUSTERS)
-    share, com, inertia = berries.mass_by_segment(berry_count, seed, count)
+    share, com, inertia = berries.mass_by_segment(berry_count, seed, variety, count)
     number = np.arange(share.shape[1])
     here = number < count[:, None]
     h = length / count
@@ -286,7 +288,7 @@ class TreeBuilder:
         Args:
             parent: the last segment of the peduncle.
             mass: mass of the bunch [kg].
-            count: number of berries, 1 to 140.
+            count: number of berries, 1 to 140, or 200 of a wine grape.
             seed: seed that selects the arrangement of berries among the prototypes of :mod:`vinesim.scene.berries`.
             variety: index into :data:`vinesim.scene.berries.VARIETIES`.
             rest: [4] rotation relative to the parent.
@@ -302,7 +304,7 @@ class TreeBuilder:
         """
         parent = checked_index("body", parent, len(self.bodies))
         variety = checked_index("variety", variety, len(berries.VARIETIES))
-        most = berries.PROTOTYPE_BERRIES[-1]
+        most = berries.most_berries(variety)
         if not 0.0 < mass < np.inf or not 1 <= count <= most:
             raise ValueError(f"bunch of {mass} kg, {count} berries; give a finite mass above 0 and 1 to {most} berries")
         plausibility.check(f"bunch on body {parent}", "mass", mass)
@@ -311,13 +313,14 @@ class TreeBuilder:
         berry = berries.VARIETIES[variety]
         share = parameters.bunch.stem_share.value
         size = berry.volume_radius * math.cbrt(mass * (1.0 - share) / (count * berry.mass))
-        length, radius = berries.hull_size(np.array(count), np.array(seed)) * size
+        length, radius = berries.hull_size(np.array(count), np.array(seed), variety) * size
         one = segment_bunches(
             np.array([mass]),
             np.array([length]),
             np.array([radius]),
             np.array([count]),
             np.array([seed]),
+            np.array([variety]),
             parameters.rachis,
             share,
         )

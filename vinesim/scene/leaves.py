@@ -1,8 +1,9 @@
-"""Leaves: the outline of a blade (five lobes, saw teeth, a sinus at the petiole), and leaves at the nodes of shoots.
+"""Leaves: outlines of blades, and leaves at the nodes of shoots.
 
-The outline is in polar form around the petiole's junction, with theta = 0 at the tip. A lobe at angle t with its tip at
-distance L is the wedge ``r = L / (cos D + kappa |sin D|)``, D = theta - t; the blade is the union of its lobes. All
-lengths are in units of ``Model.leaf_size``, half of the blade's largest width.
+An outline is in polar form around the petiole's junction, with theta = 0 at the tip: a smooth five-cornered blade, from
+which sinuses are cut, with small irregular teeth. There are outlines of three depths of sinus, from nearly entire to
+deeply five-lobed, with some leaves that insects have holed or whose tips are torn off. All outlines have the same area;
+lengths are in units of ``Model.leaf_size``, about half of the blade's width.
 """
 
 from __future__ import annotations
@@ -16,57 +17,134 @@ from vinesim.core import frames
 from vinesim.scene.plant_parameters import Leaf
 from vinesim.scene.spec import Scene
 
-SHAPE_COUNT = 4
-"""Number of different outlines, from deeply cut to round."""
-
-_LOBES = ((0.0, 1.0), (np.radians(54.0), 0.88), (np.radians(112.0), 0.66))
-"""Angle [rad] and length of middle, upper and lower lobes."""
-_KAPPA = ((1.15, 1.0, 0.75), (1.45, 1.3, 0.9), (0.95, 0.85, 0.65), (1.3, 1.15, 0.8))
-"""Slenderness kappa of the middle, upper and lower lobes in each shape."""
-_TEETH = 0.075
-_TEETH_PER_LOBE = 11.0
+BLADE_AREA = 2.3318158002798466
+"""[leaf_size^2] Area of each flat blade without its holes. The number defines the unit ``leaf_size``, so that leaves
+have the sizes that they had when an earlier set of outlines had this mean area."""
 
 
-def _blade(theta: np.ndarray, shape: int) -> np.ndarray:
-    """Returns the radius of the outline in units of the length of the middle lobe."""
-    radius = np.full_like(theta, 0.05)
-    for (angle, length), kappa in zip(_LOBES, _KAPPA[shape], strict=True):
-        for side in (1.0, -1.0) if angle else (1.0,):
-            away = np.abs((theta - side * angle + np.pi) % (2.0 * np.pi) - np.pi)
-            tooth = (_TEETH_PER_LOBE * away**0.85 + 0.17 * shape) % 1.0
-            depth = _TEETH * np.clip(away / 0.06, 0.0, 1.0) * np.abs(2.0 * tooth - 1.0)
-            wedge = length * (1.0 - depth) / (np.cos(away) + kappa * np.sin(away))
-            radius = np.maximum(radius, np.where(away < 1.25, wedge, 0.0))
-    closing = np.clip((np.pi - np.abs(theta) - 0.10) / 0.42, 0.0, 1.0)
-    return radius * (0.06 + 0.94 * closing * closing * (3.0 - 2.0 * closing))
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Lobing:
+    """Sinuses of leaves, by their greatest notes of OIV descriptor 094. Depths are guesses, tuned by eye."""
+
+    note: float
+    upper: float
+    lower: float
+    """Depth of the upper and lower lateral sinuses, as a fraction of the blade's radius."""
+    width: float
+    """Half width of a sinus [rad]."""
+
+
+_LOBINGS = (_Lobing(2.0, 0.05, 0.03, 0.16), _Lobing(6.0, 0.20, 0.10, 0.17), _Lobing(9.0, 0.44, 0.26, 0.15))
+_VARIANTS = 4
+"""Number of outlines of each depth of sinus: two whole ones, one with holes, one with a torn lobe."""
+SHAPE_COUNT = len(_LOBINGS) * _VARIANTS
+"""Number of different outlines."""
+_HOLED = 2
+_TORN = 3
+"""Numbers of the variants with holes and with a torn lobe."""
+
+_BLADE = (
+    (0.0, 1.0), (14.0, 0.95), (27.0, 0.90), (40.0, 0.89), (52.0, 0.93), (68.0, 0.88), (84.0, 0.83), (98.0, 0.81),
+    (112.0, 0.82), (135.0, 0.72), (152.0, 0.64), (165.0, 0.52), (174.0, 0.22), (180.0, 0.06),
+)  # fmt: skip
+"""Angle from the midrib [deg] and radius of the blade without sinuses, in units of the midrib."""
+_TIPS = ((0.0, 0.06), (52.0, 0.05), (112.0, 0.03))
+"""Angle [deg] of the lobes' tips, and by how much the tips stand out."""
+_SINUSES = (27.0, 84.0)
+"""Angles of the upper and lower lateral sinuses [deg]."""
+_PETIOLE_SINUS = np.radians(163.0)
+"""Angle from which on there are no teeth."""
+_TOOTH_WIDTH = (0.06, 0.13)
+_TOOTH_LENGTH = (0.022, 0.055)
+"""Range of the widths and lengths of teeth, in units of the midrib: GUESSED."""
+_KNOTS = 4096
 
 
 @functools.cache
-def _circle(shape: int) -> tuple[float, float]:
-    """Returns the half width and area of the unscaled blade."""
-    theta = np.linspace(-np.pi, np.pi, 4001)
-    radius = _blade(theta, shape)
-    width = float(np.abs(radius * np.sin(theta)).max())
-    return width, float(np.trapezoid(0.5 * radius * radius, theta))
+def _blade(shape: int) -> np.ndarray:
+    """Returns the radius of the outline [_KNOTS + 1] at equal steps of the angle from -pi to pi, in units of the
+    midrib."""
+    lobing = _LOBINGS[shape // _VARIANTS]
+    rng = np.random.default_rng([shape, 9])
+    theta = np.linspace(-np.pi, np.pi, _KNOTS + 1)
+    angle, length = np.array(_BLADE).T
+    radius = np.interp(np.abs(theta), np.radians(angle), length)
+    around = np.exp(-0.5 * (np.arange(-200, 201) * (2.0 * np.pi / _KNOTS) / 0.07) ** 2)
+    radius = np.convolve(np.pad(radius[:-1], 200, mode="wrap"), around / around.sum(), "valid")
+    radius = np.append(radius, radius[0])
+    for side in (1.0, -1.0):
+        for (at, tall), turn in zip(_TIPS, rng.normal(0.0, 0.03, 3), strict=True):
+            away = np.abs(theta - side * (np.radians(at) + turn))
+            radius += (1.0 if at else 0.5) * tall * np.exp(-away / 0.10)
+        for at, deep in zip(_SINUSES, (lobing.upper, lobing.lower), strict=True):
+            away = (theta - side * (np.radians(at) + rng.normal(0.0, 0.04))) / (lobing.width * rng.uniform(0.8, 1.2))
+            radius *= 1.0 - deep * rng.uniform(0.75, 1.25) * np.exp(-(np.abs(away) ** 2.5))
+    for wave in range(1, 6):
+        radius *= 1.0 + 0.012 * np.cos(wave * theta + rng.uniform(0.0, 2.0 * np.pi))
+    whole = radius + _teeth(theta, radius, rng)
+    if shape % _VARIANTS != _TORN:
+        return whole
+    away = np.cos(theta - np.radians(rng.choice([0.0, 52.0, -52.0]) + rng.normal(0.0, 12.0)))
+    cut = rng.uniform(0.66, 0.82) * (1.0 + 0.04 * np.cos(9.0 * theta) + 0.03 * np.cos(23.0 * theta))
+    return np.where(away > 0.6, np.minimum(whole, cut / np.maximum(away, 0.6)), whole)
+
+
+def _teeth(theta: np.ndarray, radius: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Returns the height of the teeth at the angles ``theta`` [n] rad of an outline of ``radius`` [n]: convex, of
+    random width and length."""
+    place = radius[:, None] * np.stack([np.cos(theta), np.sin(theta)], 1)
+    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(place, axis=0), axis=1)))
+    ends = np.append(0.0, np.cumsum(rng.uniform(*_TOOTH_WIDTH, 200)))
+    tooth = np.searchsorted(ends, along, side="right") - 1
+    share = (along - ends[tooth]) / (ends[tooth + 1] - ends[tooth])
+    height = rng.uniform(*_TOOTH_LENGTH, 200)[tooth] * (1.0 - np.abs(1.7 * share - 0.9).clip(0.0, 1.0) ** 1.4)
+    return height * np.clip((_PETIOLE_SINUS - np.abs(theta)) / 0.15, 0.0, 1.0)
+
+
+@functools.cache
+def blade_holes(shape: int) -> np.ndarray:
+    """Returns the round holes of a blade: u and v of the centre and radius [hole, 3], in units of the midrib; u is
+    across the midrib, v along it. Holes do not overlap."""
+    if shape % _VARIANTS != _HOLED:
+        return np.zeros((0, 3))
+    rng = np.random.default_rng([shape, 10])
+    holes = np.zeros((0, 3))
+    while len(holes) < 7:
+        turn, away, wide = rng.uniform(-2.2, 2.2), rng.uniform(0.15, 0.55), 0.012 + 0.05 * rng.uniform() ** 3
+        one = np.array([away * np.sin(turn), away * np.cos(turn), wide])
+        if (np.hypot(*(holes[:, :2] - one[:2]).T) > holes[:, 2] + wide).all():
+            holes = np.concatenate([holes, one[None]])
+    return holes
+
+
+@functools.cache
+def midrib_length(shape: int) -> float:
+    """Returns the length of the midrib from the petiole to the tip of the whole lobe [leaf_size]."""
+    theta = np.linspace(-np.pi, np.pi, _KNOTS + 1)
+    blade = float(np.trapezoid(0.5 * _blade(shape) ** 2, theta))
+    return float(np.sqrt(BLADE_AREA / (blade - np.pi * (blade_holes(shape)[:, 2] ** 2).sum())))
 
 
 def blade_outline(theta: np.ndarray, shape: int = 0) -> np.ndarray:
     """Returns the distance from the petiole's junction to the blade's edge at the angle ``theta`` [rad], -pi to pi, in
     units of ``leaf_size``."""
-    return _blade(np.asarray(theta, float), shape) / _circle(shape)[0]
+    knots = np.linspace(-np.pi, np.pi, _KNOTS + 1)
+    return np.interp(np.asarray(theta, float), knots, _blade(shape)) * midrib_length(shape)
 
 
-def blade_area(shape: int = 0) -> float:
-    """Returns the area of the flat blade [leaf_size^2]."""
-    width, blade = _circle(shape)
-    return blade / width**2
-
-
-def blade_shape(leaf: np.ndarray) -> np.ndarray:
+def blade_shape(leaf: np.ndarray, sinus_depth: np.ndarray | None = None) -> np.ndarray:
     """Returns the index of the outline [leaf] of each leaf, computed from the leaf's number, so that it is equal on all
-    clients."""
-    scrambled = np.asarray(leaf, np.uint32) * np.uint32(2654435761)
-    return (scrambled >> np.uint32(16)).astype(np.int32) % SHAPE_COUNT
+    clients.
+
+    ``sinus_depth``: [leaf] depth of the sinuses of the leaf's variety, note of OIV descriptor 094; 0 or None: leaves
+    have all outlines.
+    """
+    scrambled = (np.asarray(leaf, np.uint32) * np.uint32(2654435761) >> np.uint32(16)).astype(np.int32)
+    mixed = scrambled % SHAPE_COUNT
+    if sinus_depth is None:
+        return mixed
+    depth = np.searchsorted([one.note for one in _LOBINGS[:-1]], sinus_depth)
+    return np.where(np.asarray(sinus_depth) > 0.0, depth * _VARIANTS + scrambled % _VARIANTS, mixed)
 
 
 # Leaves at nodes of shoots, from random numbers: petiole, blade, age, mass and drag.

@@ -27,6 +27,19 @@ _UNIT_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 _UNIT_QUAT = (0.0, 0.0, 0.0, 1.0)
 
 
+@dataclasses.dataclass(frozen=True, slots=True)
+class FruitLook:
+    """What is visible of the state of the fruit; see :class:`vinesim.scene.spec.Fruit`."""
+
+    ripeness: tuple[float, float] | None
+    """Least and greatest ripeness of a bunch; None: not given."""
+    rot: float
+    shrivelled: float
+    sunburn: float
+    seed: int
+    """Seed of the random differences between bunches and berries."""
+
+
 @dataclasses.dataclass
 class Model(StructOfArrays):
     """Constants of a vineyard. The field declarations contain units and shapes; the module docstring explains the
@@ -118,7 +131,7 @@ class Model(StructOfArrays):
     leaf_pose: np.ndarray = array("leaf", 7, unit="m, 1", fill=_UNIT_POSE)
     """Blade frame in the body's frame: origin where petiole meets blade, x along the midrib, z the upper side."""
     leaf_size: np.ndarray = array("leaf", unit="m")
-    """Half of the blade's width; it scales the outline."""
+    """About half of the blade's width; it scales the outline, whose area is ``leaves.BLADE_AREA`` in this unit."""
     leaf_age: np.ndarray = array("leaf", unit="1")
     """Age from 0 (young and green) to 1 (yellow)."""
 
@@ -149,11 +162,17 @@ class Model(StructOfArrays):
     """What is seen beside the plants; None: nothing. Old wood that can be touched is in the arrays."""
     clutter_seed: int = 0
     """Seed of the clutter: the scene's."""
+    fruit_look: FruitLook | None = None
+    """Visible state of the fruit; None: all fruit is ripe and sound. It is not part of the digest."""
 
     def copy(self) -> Model:
-        """Returns a deep copy of the arrays, with the same terrain and clutter."""
+        """Returns a deep copy of the arrays, with the same terrain, clutter and look of the fruit."""
         return dataclasses.replace(
-            super().copy(), terrain=self.terrain, clutter=self.clutter, clutter_seed=self.clutter_seed
+            super().copy(),
+            terrain=self.terrain,
+            clutter=self.clutter,
+            clutter_seed=self.clutter_seed,
+            fruit_look=self.fruit_look,
         )
 
     def digest(self) -> str:
@@ -202,6 +221,13 @@ class Model(StructOfArrays):
             owner[body] = bunch
             body = self.body_parent[body]
         return owner
+
+    def variety_of_trees(self) -> np.ndarray:
+        """[tree] Variety of each tree's vine, as an index into ``vinesim.scene.berries.VARIETIES``: that of the vine's
+        bunches; -1 for a vine without bunches."""
+        vines = np.full(int(self.tree_vine.max(initial=-1)) + 2, -1, np.int32)  # the last entry is for trees of no vine
+        vines[self.tree_vine[self.body_tree[self.bunch_body]]] = self.bunch_variety
+        return vines[self.tree_vine]
 
     def is_on_arm(self) -> np.ndarray:
         """Whether the root of each tree sits on a piece of arm that can twist [tree] bool."""

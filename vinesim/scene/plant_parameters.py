@@ -201,12 +201,29 @@ class VineParameters(_Part, frozen=True, kw_only=True):
 
 
 class Berry(_Part, frozen=True, kw_only=True):
-    """Parameters of the berries of one variety."""
+    """Parameters of the berries, bunches and leaves of one variety. Those that are missing are a table grape's: bunches
+    as in the plant's file, and berries that turn evenly from green to their colour."""
 
     name: str
     colour: Annotated[Colour, "1"]
+    """Colour of a ripe berry."""
     radius: Annotated[Number, "m"]
     elongation: Annotated[Number, "1"]
+    unripe: Annotated[Colour | None, "1"] = None
+    """Colour of a green berry."""
+    turning: Annotated[Colour | None, "1"] = None
+    """Colour of a berry halfway through veraison (the change of colour)."""
+    veraison: Annotated[Number | None, "1"] = None
+    """Standard deviation of the ripeness (0 to 1) of the berries of one bunch that is changing its colour."""
+    bunch_mass: Annotated[Number | None, "kg"] = None
+    bunch_mass_variation: Annotated[Number | None, "1"] = None
+    bunch_mass_range: Annotated[Range | None, "kg"] = None
+    compactness: Annotated[Number | None, "1"] = None
+    """Density of the bunch, note of OIV descriptor 204: 1 very loose, 9 very dense."""
+    peduncle_length: Annotated[Range | None, "m"] = None
+    leaf_area: Annotated[Number | None, "m^2"] = None
+    sinus_depth: Annotated[Number | None, "1"] = None
+    """Depth of the leaf's upper lateral sinuses, note of OIV descriptor 094: 1 very shallow, 9 very deep."""
 
 
 class Varieties(_Part, frozen=True, kw_only=True):

@@ -145,6 +145,16 @@ class Fruit(_Part, frozen=True, kw_only=True):
     """Smallest and largest number of bunches on a vine."""
     varieties: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
     """Names from :data:`vinesim.scene.berries.VARIETIES`. Row i has variety i modulo their number."""
+    ripeness: tuple[Share, Share] | None = None
+    """Least and greatest ripeness of a bunch, 0 (green) to 1 (ripe), between which bunches are uniformly distributed.
+    By default all fruit is ripe, and data sets have bunches of every ripeness. Ripeness and the shares below change
+    pictures only."""
+    rot: Share = 0.0
+    """Share of the bunches with a patch of grey mould (botrytis)."""
+    shrivelled: Share = 0.0
+    """Share of the bunches with shrivelled berries."""
+    sunburn: Share = 0.0
+    """Share of the bunches with sunburnt berries on one side."""
 
 
 class Box(_Part, frozen=True, kw_only=True):
@@ -305,6 +315,8 @@ def _find_error(scene: Scene) -> str:
     low, high = scene.fruit.bunches
     if not 0 <= low <= high:
         return f"fruit.bunches is [{low}, {high}]; give [fewest, most] with 0 <= fewest <= most"
+    if scene.fruit.ripeness is not None and scene.fruit.ripeness[0] > scene.fruit.ripeness[1]:
+        return f"fruit.ripeness is {list(scene.fruit.ripeness)}; give [least, greatest], 0 to 1, rising"
     rows = scene.layout.rows
     vines = scene.layout.vines
     for i, (row, place) in enumerate(scene.layout.missing):

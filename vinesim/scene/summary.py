@@ -43,5 +43,4 @@ def summary_rows(scene: Scene, model: Model) -> list[tuple[str, str, str]]:
 
 def total_leaf_area(model: Model) -> float:
     """Returns the area of one side of all flat blades [m^2]."""
-    unit = np.array([leaves.blade_area(shape) for shape in range(leaves.SHAPE_COUNT)])
-    return float((unit[leaves.blade_shape(np.arange(len(model.leaf_size)))] * model.leaf_size.astype(float) ** 2).sum())
+    return float(leaves.BLADE_AREA * (model.leaf_size.astype(float) ** 2).sum())

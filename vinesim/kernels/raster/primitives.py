@@ -6,7 +6,7 @@ Every primitive is four vectors ``a b c d`` whose meaning follows from its kind:
 kind       a                       b                       c                            d
 ========== ======================= ======================= ============================ =====================
 CONE       start, radius           end, radius             along, seed, sky at end, 1   -
-SPHEROID   centre, radius          axis, length / width    seed, depth in bunch, -, -   occlusion vector, mean
+SPHEROID   centre, radius          axis, length / width    seed, depth, rot, dryness    occlusion vector, mean
 LEAF       petiole end, size       midrib, outline number  upper normal, seed           curvatures a b c, age
 BOX        centre, half x          quaternion              half y, half z, seed, -      -
 ELLIPSOID  centre, half x          quaternion              half y, half z, seed, -      -

@@ -205,16 +205,20 @@ def berry_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: fl
     n = wp.normalize(scale_along(e, axis, stretch))
     tint = materials.tint[i]
     s = diffuse_surface(n, tint, materials.sky[i])
-    # occlusion by neighbouring berries: a baked cosine lobe
-    s.occlusion = wp.clamp(1.0 - block[3] - wp.dot(xyz(block), n), 0.12, 1.0) * (0.4 + 0.6 * c4[1])
-    light = tint[1] * 2.2  # pale berries transmit light, dark ones show bloom
-    pale = wp.clamp(light, 0.0, 1.0)
+    rot = c4[2]
+    dry = wp.max(c4[3], 0.0)
+    burnt = wp.max(-c4[3], 0.0)
+    pale = wp.clamp(tint[1] * 2.2, 0.0, 1.0)  # pale berries transmit light, dark ones show bloom
+    # occlusion by neighbouring berries: a baked cosine lobe; light comes through pale neighbours
+    s.occlusion = wp.clamp(1.0 - block[3] - wp.dot(xyz(block), n), 0.12 + 0.2 * pale, 1.0) * (0.4 + 0.6 * c4[1])
     red = wp.clamp((tint[0] - tint[1]) * 4.0, 0.0, 1.0) * (1.0 - pale)
     s.wrap = wp.vec3(0.12, 0.06, 0.08) + wp.vec3(0.33, 0.34, 0.12) * pale + wp.vec3(0.2, 0.05, 0.02) * red
-    s.transmission = wp.vec3(0.95, 0.76, 0.12) * pale + wp.vec3(0.26, 0.03, 0.012) * red + wp.vec3(0.03, 0.003, 0.004)
-    bloom = 0.46 - 0.32 * pale - 0.10 * red
+    s.transmission = tint * (1.8 * (1.0 - rot)) * pale
+    s.transmission += wp.vec3(0.26, 0.03, 0.012) * red + wp.vec3(0.03, 0.003, 0.004)
+    bloom = 0.36 - 0.22 * pale - 0.06 * red
     s.specular = 0.045
-    bm = bloom * 0.6
+    bm = bloom * 0.45
+    fuzz = float(0.4)
     if pixel < a4[3] * 0.35:
         w = wp.normalize(e)
         seed = c4[0]
@@ -223,16 +227,24 @@ def berry_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: fl
         )
         fine = sample_bilinear(materials.noise_texture, w[0] * 1.1 + w[2] * 0.6 + seed, w[1] * 1.1 - w[2] * 0.4)
         s.albedo = tint * (0.86 + 0.28 * wide[1])
-        s.albedo = mix(s.albedo, wp.vec3(0.46, 0.30, 0.06), pale * 0.35 * smoothstep(0.5, 0.8, wide[0] + 0.15 * n[2]))
+        amber = pale * 0.35 * wp.clamp(8.0 * (tint[0] / tint[1] - 0.8), 0.0, 1.0)
+        s.albedo = mix(s.albedo, wp.vec3(0.46, 0.30, 0.06), amber * smoothstep(0.5, 0.8, wide[0] + 0.15 * n[2]))
         s.albedo = s.albedo * (1.0 + pale * (0.14 * fine[2] - 0.07) + red * wp.where(fine[3] > 0.82, 0.22, 0.0))
         along = wp.dot(w, axis)
         bm = bloom * smoothstep(0.30, 0.62, wide[0] * 0.55 + wide[1] * 0.45 + 0.12 * n[2]) * (0.75 + 0.5 * fine[1])
         scar = smoothstep(0.986, 0.994, along)
         s.albedo = mix(s.albedo, wp.vec3(0.07, 0.045, 0.025), scar)
         s.albedo = mix(s.albedo, wp.vec3(0.16, 0.18, 0.06), 0.7 * smoothstep(-0.95, -0.985, along))
-    s.albedo = mix(s.albedo, wp.vec3(0.40, 0.43, 0.60), wp.clamp(bm, 0.0, 0.8))
-    s.shininess = 260.0 - 300.0 * wp.min(bm, 0.75)
-    s.reflectivity = 1.0 - wp.min(bm * 1.6, 0.85)
+        # damage: sunburn above, the fur of grey mould, the wrinkles of a shrivelled berry
+        burn = burnt * smoothstep(-0.3, 0.5, n[2] + wide[0] - 0.5)
+        s.albedo = mix(s.albedo, wp.vec3(0.22, 0.11, 0.04), burn)
+        fuzz = smoothstep(0.40, 0.65, fine[1])
+        s.normal = wp.normalize(n + wp.vec3(fine[1] - 0.5, fine[2] - 0.5, fine[3] - 0.5) * (1.6 * dry + 0.8 * rot))
+    bm = bm * (1.0 - rot) * (1.0 - 0.5 * dry)
+    s.albedo = mix(s.albedo, wp.vec3(0.40, 0.43, 0.60) + wp.vec3(0.0, 0.04, -0.36) * pale, wp.clamp(bm, 0.0, 0.8))
+    s.albedo = mix(s.albedo, wp.vec3(0.33, 0.30, 0.25), rot * 0.75 * fuzz)
+    s.shininess = (70.0 - 72.0 * wp.min(bm, 0.75)) * (1.0 - 0.8 * rot)
+    s.reflectivity = 0.6 * (1.0 - wp.min(bm * 1.6, 0.85)) * (1.0 - rot)
     return s
 
 

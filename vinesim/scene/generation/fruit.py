@@ -12,7 +12,7 @@ from vinesim.core import frames, portable_math
 from vinesim.scene import berries
 from vinesim.scene.generation.fixed_structure import FixedStructure
 from vinesim.scene.generation.shoot_slots import AXIS_SEGMENTS, MAX_BUNCHES, PEDUNCLE_SEGMENTS
-from vinesim.scene.plant_parameters import Range, VineParameters
+from vinesim.scene.plant_parameters import Bunch, Range, VineParameters
 from vinesim.scene.spec import Scene
 
 Sampler = Callable[..., np.ndarray]
@@ -21,6 +21,9 @@ generator of its vine."""
 
 MIN_GAP = 0.02
 """Smallest gap between a bunch and neighbouring bunches, poles and trunks [m]."""
+_THINNEST = -0.3
+"""Place of the thinnest stalk on the plant file's range of stalks, whose ends are those of the lightest (0) and of the
+heaviest bunch (1) of table grapes. Stalks of lighter bunches of wine grapes are not thinner. GUESSED."""
 MAX_BUCKLING_LOAD = 0.6
 """Largest m g a^2 / EI of bunches at height a above the base of their shoot; a uniform column buckles at 2.47."""
 
@@ -52,19 +55,21 @@ def sample_fruit(
     """
     fruit = parameters.bunch
     peduncle = parameters.peduncle
-    sigma = math.sqrt(math.log(1.0 + fruit.mass_variation.value**2))
-    mass = fruit.mass.value * portable_math.exp(sigma * normal(MAX_BUNCHES) - 0.5 * sigma**2)
-    mass = np.clip(mass, *fruit.mass_range.value)
+    chance = normal(MAX_BUNCHES)
     names = [v.name for v in berries.VARIETIES]
     in_turn = np.array([names.index(name) for name in scene.fruit.varieties])
-    variety = np.broadcast_to(in_turn[row % len(in_turn)][:, None], mass.shape)
+    variety = np.broadcast_to(in_turn[row % len(in_turn)][:, None], chance.shape)
+    mean, sigma, low, high = _bunch_masses(fruit)[:, variety]
+    mass = mean * portable_math.exp(sigma * chance - 0.5 * sigma**2)
+    mass = np.clip(mass, low, high)
     juice = mass * (1.0 - fruit.stem_share.value)
     berry_mass = np.array([v.mass for v in berries.VARIETIES])[variety]
-    count = np.clip(np.round(juice / berry_mass), berries.MIN_BERRIES, berries.MAX_BERRIES).astype(int)
+    most = np.array([berries.most_berries(v) for v in range(len(berries.VARIETIES))])[variety]
+    count = np.clip(np.round(juice / berry_mass), berries.MIN_BERRIES, most).astype(int)
     seed = (uniform(MAX_BUNCHES) * 2.0**32).astype(np.uint32)
     volume_radius = np.array([v.volume_radius for v in berries.VARIETIES])[variety]
     size = volume_radius * portable_math.cbrt(juice / (count * berry_mass))
-    hull = berries.hull_size(count, seed) * size[..., None]
+    hull = berries.hull_size(count, seed, variety) * size[..., None]
     drawn = {
         "mass": mass,
         "count": count,
@@ -73,7 +78,7 @@ def sample_fruit(
         "seed": seed,
         "variety": variety,
         "pull": peduncle.pull.at(uniform(MAX_BUNCHES)),
-        "thick": 0.5 * peduncle.diameter.at(_fraction(mass, fruit.mass_range)),
+        "thick": 0.5 * peduncle.diameter.at(np.maximum(_fraction(mass, fruit.mass_range), _THINNEST)),
     }
 
     # the second bunch grows about two nodes above the first one, never at the tip of the same segment
@@ -84,7 +89,8 @@ def sample_fruit(
     at[:, 1] = np.maximum(at[:, 1], at[:, 0] + 1)
     rows = np.arange(len(points))[:, None]
     top = points[rows, at + 1]
-    long = peduncle.length.at(uniform(MAX_BUNCHES)) / PEDUNCLE_SEGMENTS
+    shortest, longest = np.array([v.peduncle_length or peduncle.length.value for v in berries.VARIETIES]).T[:, variety]
+    long = (shortest + (longest - shortest) * uniform(MAX_BUNCHES)) / PEDUNCLE_SEGMENTS
     angle = 2.0 * np.pi * uniform(MAX_BUNCHES)
     level = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], -1)
     tilt = np.clip(0.10 + 0.04 * normal(MAX_BUNCHES), 0.02, 0.18)[..., None]
@@ -97,6 +103,18 @@ def sample_fruit(
     end = middle + second * long[..., None]
     axis = frames.normalize(0.02 * normal(MAX_BUNCHES, 3) - [0.0, 0.0, 1.0])
     return drawn, at, np.stack([top, middle, end], 2), axis, level
+
+
+def _bunch_masses(bunch: Bunch) -> np.ndarray:
+    """Returns mean [kg], sigma of the lognormal distribution, smallest and largest mass [kg] of the bunches of all
+    varieties [4, variety]. ``bunch``: parameters of varieties without their own."""
+    masses = []
+    for kind in berries.VARIETIES:
+        variation = bunch.mass_variation.value if kind.bunch_mass_variation is None else kind.bunch_mass_variation
+        mean = bunch.mass.value if kind.bunch_mass is None else kind.bunch_mass
+        ends = kind.bunch_mass_range or bunch.mass_range.value
+        masses.append((mean, math.sqrt(math.log(1.0 + variation**2)), *ends))
+    return np.array(masses).T
 
 
 def _fraction(value: np.ndarray, within: Range) -> np.ndarray:

@@ -11,6 +11,7 @@ import numpy as np
 
 from vinesim.core import frames, portable_math
 from vinesim.scene import builder
+from vinesim.scene.berries import VARIETIES
 from vinesim.scene.generation.shoot_slots import (
     AXIS_SEGMENTS,
     CORE_SLOTS,
@@ -160,11 +161,11 @@ def _fill_bunch(parameters: VineParameters, shoots: Shoots, bodies: Bodies, k: i
     has = np.flatnonzero(shoots.has_bunch[:, k])
     if len(has) == 0:
         return
-    mass, long, wide, count, seed = (
-        shoots.fruit[name][has, k] for name in ("mass", "length", "radius", "count", "seed")
+    mass, long, wide, count, seed, variety = (
+        shoots.fruit[name][has, k] for name in ("mass", "length", "radius", "count", "seed", "variety")
     )
     pieces = builder.segment_bunches(
-        mass, long, wide, count, seed, parameters.rachis, parameters.bunch.stem_share.value
+        mass, long, wide, count, seed, variety, parameters.rachis, parameters.bunch.stem_share.value
     )
     bodies.mass[has, bunch], bodies.com[has, bunch], bodies.inertia[has, bunch] = pieces.compound()
     for name, head in bodies.head.items():
@@ -247,6 +248,12 @@ def _fill_rod(
 # Leaves at the nodes of shoots: positions of the nodes, and the leaves' weight on the bodies that carry them.
 
 
+def _leaf_size(parameters: VineParameters, variety: np.ndarray) -> np.ndarray:
+    """Returns the ratio [...] of the leaf area of each ``variety`` [...] to that of the plant's file."""
+    usual = parameters.leaf.area.at(0.5)
+    return np.array([(v.leaf_area or usual) / usual for v in VARIETIES])[variety]
+
+
 def place_leaves(scene: Scene, parameters: VineParameters, shoots: Shoots, bodies: Bodies) -> dict[str, np.ndarray]:
     """Place leaves at the nodes, alternately left and right, and add their weight to the bodies that carry them."""
     node = np.arange(MAX_NODES + LATERAL_NODES)
@@ -266,7 +273,7 @@ def place_leaves(scene: Scene, parameters: VineParameters, shoots: Shoots, bodie
         share=share,
         up=shoots.up[:, None],
         hand=np.where((rank + shoots.lateral_at[:, None]) % 2, 1.0, -1.0)[..., None],
-        grown=np.where(main, 1.0, LATERAL_AREA),
+        grown=np.where(main, 1.0, LATERAL_AREA) * _leaf_size(parameters, shoots.fruit["variety"][:, :1]),
     )
     leaf = grow_leaves(scene, parameters.leaf, nodes, shoots.leaf_normal, shoots.leaf_uniform)
     present = (rank < many) & leaf["present"] & (main | shoots.has_lateral[:, None])

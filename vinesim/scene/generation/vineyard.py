@@ -29,7 +29,7 @@ from vinesim.scene.generation.uneven_ground import (
     raise_ties,
 )
 from vinesim.scene.ids import Organ
-from vinesim.scene.model import Model
+from vinesim.scene.model import FruitLook, Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.plant_import.imported_plant import load_imported_plant
 from vinesim.scene.plant_import.ties import tie_to_wires
@@ -61,6 +61,7 @@ def generate(scene: Scene) -> Model:
         wind=Wind(),
         datum=Datum(),
         spawns=(),
+        fruit=msgspec.structs.replace(scene.fruit, ripeness=None, rot=0.0, shrivelled=0.0, sunburn=0.0),
         physics=PhysicsParameters(),
         plants="",
         imported=(),
@@ -74,8 +75,9 @@ def generate(scene: Scene) -> Model:
     imported = [(load_imported_plant(one.file), msgspec.structs.replace(one, file="")) for one in scene.imported]
     digest = disk_cache.source_digest(_code_digest(), msgspec.json.encode((plants, parameters, imported, ground)))
     clutter, seed = _clutter_of(scene)
+    look = _fruit_look(scene)
     arrays = disk_cache.load_or_make("vineyard", digest, make)
-    return Model(terrain=terrain, clutter=clutter, clutter_seed=seed, **arrays).check()
+    return Model(terrain=terrain, clutter=clutter, clutter_seed=seed, fruit_look=look, **arrays).check()
 
 
 def generate_uncached(scene: Scene) -> Model:
@@ -96,6 +98,14 @@ def _code_digest() -> str:
     package = pathlib.Path(builder.__file__).parent
     others = [pathlib.Path(str(module.__file__)) for module in (frames, array_fields, portable_math)]
     return disk_cache.source_digest(package, *others, repr(berries.VARIETIES))
+
+
+def _fruit_look(scene: Scene) -> FruitLook | None:
+    """Returns the visible state of the scene's fruit; None if the scene does not describe it."""
+    fruit = scene.fruit
+    if fruit.ripeness is None and not (fruit.rot or fruit.shrivelled or fruit.sunburn):
+        return None
+    return FruitLook(fruit.ripeness, fruit.rot, fruit.shrivelled, fruit.sunburn, scene.seed)
 
 
 def _generate(scene: Scene, parameters: VineParameters, terrain: Terrain | None) -> Model:
@@ -119,6 +129,7 @@ def _generate(scene: Scene, parameters: VineParameters, terrain: Terrain | None)
             half = 0.5 * box.size[0], 0.5 * box.size[1]
             model.box_pose[i] = terrain.resting_pose(box.x, box.y, box.yaw, half)
     model = builder.solve_rest_pose(model).check()
+    model.fruit_look = _fruit_look(scene)
     variety = [v.name for v in berries.VARIETIES].index(scene.fruit.varieties[0])
     for number, one in enumerate(scene.imported):
         foot = one.z + float(ground_height(terrain, one.x, one.y))
@@ -215,8 +226,7 @@ def _assemble_model(
     model.leaf_base[:] = leaf["base"][shown]
     model.leaf_pose[:] = leaf["pose"][shown]
     model.leaf_age[:] = leaf["age"][shown]
-    blade = np.mean([leaves.blade_area(shape) for shape in range(leaves.SHAPE_COUNT)])
-    model.leaf_size[:] = np.sqrt(leaf["area"][shown] / blade)
+    model.leaf_size[:] = np.sqrt(leaf["area"][shown] / leaves.BLADE_AREA)
 
     for name, value in structure.fixed.items():
         getattr(model, name)[:] = value

@@ -11,7 +11,7 @@ from vinesim.core import frames
 from vinesim.scene import berries, builder
 from vinesim.scene.builder import RodMaterial, TreeBuilder
 from vinesim.scene.ids import Organ
-from vinesim.scene.leaves import LATERAL_AREA, SHAPE_COUNT, LeafNodes, add_point_masses, blade_area, grow_leaves
+from vinesim.scene.leaves import BLADE_AREA, LATERAL_AREA, LeafNodes, add_point_masses, grow_leaves
 from vinesim.scene.model import Model
 from vinesim.scene.plant_import.imported_plant import ImportedPlant, Wood
 from vinesim.scene.plant_parameters import Cane, Leaf, VineParameters
@@ -97,7 +97,13 @@ def join_models(first: Model, second: Model) -> Model:
                 here = first.fixed_organ == organ
                 b[second.fixed_organ == organ] += 1 + int(a[here].max(initial=-1))
         joined[name] = np.concatenate([a, b])
-    return Model(terrain=first.terrain, clutter=first.clutter, clutter_seed=first.clutter_seed, **joined).check()
+    return Model(
+        terrain=first.terrain,
+        clutter=first.clutter,
+        clutter_seed=first.clutter_seed,
+        fruit_look=first.fruit_look,
+        **joined,
+    ).check()
 
 
 def _on(old: np.ndarray, parent: np.ndarray) -> np.ndarray:
@@ -241,7 +247,7 @@ def _hang(
         body, float(stalk.length.at(0.5)), (thick, thick), material, _PEDUNCLE_SEGMENTS, organ=Organ.PEDUNCLE, rest=down
     )[-1]
     fruit = mass * (1.0 - parameters.bunch.stem_share.value) / berries.VARIETIES[variety].mass
-    count = int(np.clip(round(fruit), 1, berries.PROTOTYPE_BERRIES[-1]))
+    count = int(np.clip(round(fruit), 1, berries.most_berries(variety)))
     tree.add_bunch(
         last,
         mass,
@@ -369,7 +375,7 @@ def add_leaves(
     for b in np.unique(body).tolist():
         parts[b].update(zip(("mass", "com", "inertia"), (part[b] for part in heavy), strict=True))
         parts[b]["drag"] += float(grown["drag"][body == b].sum())
-    size = np.sqrt(grown["area"] / np.mean([blade_area(shape) for shape in range(SHAPE_COUNT)]))
+    size = np.sqrt(grown["area"] / BLADE_AREA)
     for i, b in enumerate(body.tolist()):
         tree.leaves.append(
             {

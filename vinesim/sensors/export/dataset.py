@@ -184,7 +184,7 @@ class VineyardRenderer:
         if not len(self.model.bunch_body):
             raise DatasetError(f"scene {self.scene.name!r} bears no bunch to look at; raise fruit.bunches")
         self.rest: Snapshot = rest_snapshot(self.model)
-        self.ripeness = Ripeness.random(len(self.model.bunch_body), self.scene.seed)
+        self.ripeness = Ripeness.for_pictures(self.model, self.scene.seed)
         self.primitives = Primitives(self.model, ripeness=self.ripeness, device=plan.device)
         self.primitives.update(self.rest)
         self.caster = RayCaster(self.primitives)

@@ -9,7 +9,7 @@ import numpy as np
 
 from vinesim.core import frames
 from vinesim.kernels.shading import materials
-from vinesim.scene.berries import VARIETIES, BerryLayout, lay_out_berries, segment_of
+from vinesim.scene.berries import VARIETIES, BerryLayout, Variety, lay_out_berries, segment_of
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.sensors.primitives.plant_primitives import STEM_TINT
@@ -23,24 +23,57 @@ _RACHIS_RADIUS = (0.0028, 0.0013)
 """Radius of the rachis at the peduncle and at its tip [m]: GUESSED."""
 _MIN_PEDICEL = 0.002
 """Length [m] below which a pedicel (berry stalk) is not drawn."""
-_GREEN = np.array([0.085, 0.150, 0.022])
-"""Colour of a hard green berry, linear RGB reflectance: GUESSED by eye."""
 _SHOT_BERRY_SIZE = 0.45
 """Size of a berry without seeds, relative to a ripe berry [1]: GUESSED."""
-_RIPENESS_SPREAD = 0.10
-"""Standard deviation of the ripeness (0 to 1) of berries within a bunch. GUESSED."""
+_ROT_COLOUR = np.array([0.130, 0.080, 0.050])
+_DRY_COLOUR = np.array([0.070, 0.042, 0.030])
+"""Colours of rotten and of shrivelled berries, linear RGB reflectance: GUESSED by eye."""
+_DRY_SIZE = 0.72
+"""Size of a shrivelled berry, relative to a sound one [1]: GUESSED."""
+_BUNCH_SPREAD = np.array([0.08, 0.04, 0.10])
+"""Standard deviations of the colour of bunches of wine grapes about that of their variety [1]: GUESSED."""
+_CROWDED = 0.21
+"""Mean share of light hidden by neighbours from which on the pedicel of a berry of a wine grape is not drawn: berries
+cover it. GUESSED."""
 _SHOT_BERRY_SHARE = 0.06
 """Share of the berries of a completely unripe bunch that have stayed small and green ("shot berries"). GUESSED."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Ripeness:
-    """Ripeness of all bunches of a vineyard, from 0 (green and hard) to 1 (as the variety is harvested)."""
+    """Ripeness of all bunches of a vineyard, from 0 (green and hard) to 1 (as the variety is harvested), and damage."""
 
     bunch: np.ndarray
     """[bunch] Mean ripeness of the berries of each bunch."""
     seed: int = 0
-    """Seed of the random differences in ripeness between berries of a bunch."""
+    """Seed of the random differences in ripeness between berries of a bunch, and of the damage."""
+    rot: float = 0.0
+    shrivelled: float = 0.0
+    sunburn: float = 0.0
+    """Shares of the bunches with rotten, shrivelled and sunburnt berries, 0 to 1."""
+
+    @classmethod
+    def of(cls, model: Model) -> Ripeness | None:
+        """Returns the state of the fruit that the model's scene describes; None if it describes none."""
+        look = model.fruit_look
+        if look is None:
+            return None
+        low, high = (1.0, 1.0) if look.ripeness is None else look.ripeness
+        rng = np.random.default_rng([look.seed, 3])
+        bunch = np.round(rng.uniform(low, high, len(model.bunch_body)), 3)
+        return cls(bunch, look.seed, look.rot, look.shrivelled, look.sunburn)
+
+    @classmethod
+    def for_pictures(cls, model: Model, seed: int) -> Ripeness:
+        """Returns the state of the fruit that the model's scene describes. If it gives no ripeness, that is
+        :meth:`random`."""
+        given = cls.of(model)
+        drawn = cls.random(len(model.bunch_body), seed)
+        if given is None:
+            return drawn
+        look = model.fruit_look
+        assert look is not None
+        return given if look.ripeness is not None else dataclasses.replace(given, bunch=drawn.bunch)
 
     @classmethod
     def random(cls, count: int, seed: int) -> Ripeness:
@@ -189,6 +222,10 @@ class _Berries:
     """[n] Relative distance of the berry from the bunch's axis, 0 to 1."""
     occlusion: np.ndarray
     """[n, 4] Occlusion by other berries, see :func:`_neighbour_occlusion`."""
+    damage: np.ndarray
+    """[n, 2] Rot, 0 to 1, and dryness, 0 to 1, or sunburn, 0 to -1."""
+    is_wine: np.ndarray
+    """[n] Whether the berry is a wine grape."""
 
     @classmethod
     def of(cls, model: Model, bunches: _Bunches, ripeness: Ripeness | None) -> _Berries:
@@ -203,8 +240,13 @@ class _Berries:
         rngs = [np.random.default_rng(int(model.bunch_seed[b])) for b in which]
         colour = _ripe_colours(np.array([v.colour for v in varieties])[bunch], rngs, count)
         seed = np.concatenate([rng.uniform(size=n) for rng, n in zip(rngs, count, strict=True)])
+        colour = colour * _bunch_tones(varieties, model.bunch_seed[which])[bunch]
+        rot, dry, burnt = np.zeros((3, len(bunch)))
         if ripeness is not None:
-            colour, radius = _apply_ripeness(colour, radius, ripeness, which, count)
+            colour, radius = _ripen(colour, radius, ripeness, which, bunch, varieties)
+            if ripeness.rot or ripeness.shrivelled or ripeness.sunburn:
+                rot, dry, burnt = _damage(position, model.bunch_length[which].astype(float), ripeness, which, bunch)
+                colour, radius = _spoil(colour, radius, rot, dry, burnt)
         away = np.hypot(*position[:, 1:].T)
         edge = np.array([_quantile_80(a) for a in np.split(away, np.cumsum(count)[:-1])])[bunch]
         first_berry = (np.cumsum(count) - count)[bunch][:, None]
@@ -221,6 +263,8 @@ class _Berries:
             seed=seed,
             depth=np.clip(0.35 + 0.65 * away / np.maximum(edge, 1e-6), 0.0, 1.0),
             occlusion=_neighbour_occlusion(position, radius, np.where(near >= 0, near + first_berry, -1)),
+            damage=np.stack([rot, dry - burnt], 1),
+            is_wine=np.array([v.style != "table" for v in varieties])[bunch],
         )
 
     def fruit(self, bunches: _Bunches) -> Batch:
@@ -229,7 +273,7 @@ class _Berries:
             SPHEROID,
             stack_columns(bunches.placed(self.position, self.segment, self.bunch), self.radius),
             b=stack_columns(bunches.rotated(self.axis, self.segment), self.elongation),
-            c=stack_columns(self.seed, self.depth, 0.0, 0.0),
+            c=stack_columns(self.seed, self.depth, self.damage),
             d=stack_columns(bunches.rotated(self.occlusion[:, :3], self.segment), self.occlusion[:, 3]),
             material=int(materials.BERRY),
             tint=self.colour,
@@ -240,6 +284,7 @@ class _Berries:
         """Returns the primitives of the pedicels: round cones from the rachis to all berries that do not touch it."""
         end = self.position - self.axis * (self.radius * self.elongation * 0.95)[:, None]
         free = np.linalg.norm(end - self.foot, axis=1) > _MIN_PEDICEL
+        free &= ~self.is_wine | (self.occlusion[:, 3] < _CROWDED)
         segment = self.segment[free]
         bunch = self.bunch[free]
         return make_batch(
@@ -264,24 +309,90 @@ def _ripe_colours(variety: np.ndarray, rngs: list[np.random.Generator], count: n
     return colour + np.array([0.055, 0.014, 0.010]) * reddish
 
 
-def _apply_ripeness(
-    colour: np.ndarray, radius: np.ndarray, ripeness: Ripeness, which: np.ndarray, count: np.ndarray
+def _bunch_tones(kinds: list[Variety], seed: np.ndarray) -> np.ndarray:
+    """Returns factors [k, 3] by which the colours of bunches differ; 1 for table grapes. ``kinds``: [k] varieties;
+    ``seed``: [k] seeds of the bunches."""
+    tones = np.stack([np.random.default_rng([int(one), 8]).normal(size=3) for one in seed])
+    tones = 1.0 + np.clip(tones, -2.0, 2.0) * _BUNCH_SPREAD
+    tones = tones * (0.9 + 0.1 * tones[:, :1])
+    return np.where(np.array([kind.style != "table" for kind in kinds])[:, None], tones, 1.0)
+
+
+def _spoil(
+    colour: np.ndarray, radius: np.ndarray, rot: np.ndarray, dry: np.ndarray, burnt: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns colours [n, 3] and radii [n] m of berries with ``rot``, ``dry`` and ``burnt`` [n], see
+    :func:`_damage`."""
+    for share, towards in ((rot, _ROT_COLOUR), (0.85 * dry, _DRY_COLOUR), (0.35 * burnt, 1.6 * _ROT_COLOUR)):
+        colour = colour * (1.0 - share[:, None]) + towards * share[:, None]
+    return colour, radius * (1.0 - (1.0 - _DRY_SIZE) * dry - 0.10 * rot)
+
+
+def _ripen(
+    colour: np.ndarray,
+    radius: np.ndarray,
+    ripeness: Ripeness,
+    which: np.ndarray,
+    owner: np.ndarray,
+    kinds: list[Variety],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns colours [n, 3] and radii [n] m of berries after unripeness is applied to those of ripe berries.
 
-    Each berry is interpolated between green and ripe; a small share stays small and green. ``which``: [k] indices of
-    the bunches; ``count``: [k] number of berries of each bunch.
+    Each berry is interpolated between green and ripe, some varieties through a third colour; a small share stays small
+    and green. ``which``: [k] indices of the bunches; ``owner``: [n] bunch of each berry, from 0 to k - 1; ``kinds``:
+    [k] varieties.
     """
-    owner = np.repeat(np.arange(len(which)), count)
+    count = np.bincount(owner, minlength=len(which))
     draws = zip(which, count, strict=True)
     draw = np.concatenate([np.random.default_rng([ripeness.seed, 4, int(b)]).uniform(size=(n, 2)) for b, n in draws])
     mean = ripeness.bunch[which][owner]
-    own = mean + _RIPENESS_SPREAD * np.sqrt(12.0) * (draw[:, 0] - 0.5) * np.minimum(4.0 * (1.0 - mean), 1.0)
+    spread = np.array([kind.veraison for kind in kinds])[owner]
+    turns = np.array([kind.turning is not None for kind in kinds])[owner]
+    nearness = np.where(turns, np.minimum(mean, 1.0 - mean), 1.0 - mean)  # to the end of veraison, or to either end
+    own = mean + spread * np.sqrt(12.0) * (draw[:, 0] - 0.5) * np.minimum(4.0 * nearness, 1.0)
     shot = draw[:, 1] < _SHOT_BERRY_SHARE * (1.0 - mean)
     own = np.where(shot, 0.0, np.clip(own, 0.0, 1.0))
     share = (own * own * (3.0 - 2.0 * own))[:, None]
+    green, middle = (
+        np.array([getattr(kind, name) or (0.0, 0.0, 0.0) for kind in kinds])[owner] for name in ("unripe", "turning")
+    )
+    first = np.minimum(2.0 * share, 1.0)
+    second = np.maximum(2.0 * share - 1.0, 0.0)
+    turned = (green * (1.0 - first) + middle * first) * (1.0 - second) + colour * second
     size = np.where(shot, _SHOT_BERRY_SIZE, 0.9 + 0.1 * own)
-    return _GREEN * (1.0 - share) + colour * share, radius * size
+    return np.where(turns[:, None], turned, green * (1.0 - share) + colour * share), radius * size
+
+
+def _damage(
+    position: np.ndarray, length: np.ndarray, ripeness: Ripeness, which: np.ndarray, owner: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns rot, dryness and sunburn [n] of berries, 0 to 1 each.
+
+    Rot spreads from one berry to those around it, shrivelled berries are mostly near the tip, and sunburn is on one
+    side of a bunch. ``position``: [n, 3] m in the bunch's frame; ``length``: [k] m; ``which``, ``owner``: as in
+    :func:`_ripen`.
+    """
+    rot, dry, burnt = np.zeros((3, len(owner)))
+    ends = np.cumsum(np.bincount(owner, minlength=len(which)))
+    for bunch, begin, end, long in zip(which, np.append(0, ends[:-1]), ends, length, strict=True):
+        rng = np.random.default_rng([ripeness.seed, 6, int(bunch)])
+        is_rotten, is_dry, is_burnt = rng.uniform(size=3) < [ripeness.rot, ripeness.shrivelled, ripeness.sunburn]
+        p = position[begin:end]
+        n = end - begin
+        reach = rng.uniform(0.12, 0.30) * long
+        centre = p[rng.integers(n)]
+        side = rng.uniform(0.0, 2.0 * np.pi)
+        chance = rng.uniform(size=(3, n))
+        if is_rotten:
+            away = np.linalg.norm(p - centre, axis=1) / reach
+            rot[begin:end] = np.clip(1.6 - away - 0.8 * chance[0], 0.0, 1.0)
+        if is_dry:
+            share = rng.uniform(0.05, 0.4) * (0.4 + 1.2 * p[:, 0] / long)
+            dry[begin:end] = np.where(chance[1] < share, 0.4 + 0.6 * chance[0], 0.0)
+        if is_burnt:
+            outside = (p[:, 1:] @ [np.cos(side), np.sin(side)]) / max(float(np.abs(p[:, 1:]).max()), 1e-6)
+            burnt[begin:end] = np.clip(2.0 * outside - 0.4 - 1.2 * chance[2], 0.0, 1.0)
+    return rot, np.where(rot > 0.0, 0.0, dry), np.where((rot > 0.0) | (dry > 0.0), 0.0, burnt)
 
 
 def _quantile_80(away: np.ndarray) -> float:

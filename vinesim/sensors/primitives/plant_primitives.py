@@ -7,6 +7,7 @@ import numpy as np
 from vinesim.core import frames
 from vinesim.kernels.shading import materials
 from vinesim.scene import leaves
+from vinesim.scene.berries import VARIETIES
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.sensors.primitives import textures
@@ -17,6 +18,10 @@ _CANE_TINT = (0.30, 0.17, 0.08)
 STEM_TINT = (0.19, 0.22, 0.075)
 """Colours [linear RGB reflectance] of brown canes (``_CANE_TINT``) and of green stems, peduncles and rachises: GUESSED
 by eye."""
+
+
+_MOST_BENT = np.array([0.5, 0.7, 0.7])
+"""Largest curvatures of a leaf: across and along the midrib, and fold at the midrib [leaf units]: GUESSED."""
 
 
 def cane_batch(model: Model) -> Batch:
@@ -56,7 +61,8 @@ def leaf_batches(model: Model) -> list[Batch]:
     if not count:
         return []
     rng = np.random.default_rng(11)
-    shape = leaves.blade_shape(np.arange(count))
+    variety = model.variety_of_trees()[model.body_tree[model.leaf_body]]
+    shape = leaves.blade_shape(np.arange(count), np.array([*(v.sinus_depth or 0.0 for v in VARIETIES), 0.0])[variety])
     q = model.leaf_pose[:, 3:]
     rib, up = (frames.rotate(q, np.broadcast_to(np.eye(3)[k], (count, 3))) for k in (0, 2))
     base = model.leaf_base
@@ -66,6 +72,9 @@ def leaf_batches(model: Model) -> list[Batch]:
     tint = np.array([0.042, 0.115, 0.016]) * (0.75 + 0.6 * young) * (1.0 + 0.10 * rng.normal(size=(count, 1)))
     tint = tint + np.array([0.030, 0.035, 0.0]) * np.clip(0.7 * rng.normal(size=(count, 1)), 0.0, 2.0)
     bend = np.stack([rng.normal(-0.10, 0.16, count), rng.normal(-0.16, 0.14, count), rng.uniform(0.0, 0.45, count)], 1)
+    bend = np.clip(
+        bend * (1.0 + rng.exponential(0.35, (count, 1))), -_MOST_BENT, _MOST_BENT
+    )  # some leaves curl or fold
     body = model.leaf_body
     tree = model.body_tree[model.leaf_body]
     names = label(Organ.LEAF, 0) + tree

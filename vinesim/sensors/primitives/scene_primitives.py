@@ -90,10 +90,10 @@ class Primitives:
         ripeness: Ripeness | None = None,
     ) -> None:
         """``grass``: tufts per square metre around the vines, 0 for bare ground without fallen leaves; ``ripeness``:
-        ripeness of the fruit, None for ripe fruit."""
+        ripeness of the fruit, None for that of the model's scene."""
         self.model = model
         self.device = device
-        self._ripeness = ripeness
+        self._ripeness = Ripeness.of(model) if ripeness is None else ripeness
         self.rasterizer: PrimitiveRasterizer | None = None
         """Rasteriser that finds the primitive in each pixel of a camera; None: the CPU kernels of
         :class:`~vinesim.sensors.raster.camera_rasterizer.CameraRasterizer`."""
@@ -513,7 +513,9 @@ def _digest(model: Model, grass: float, device: str) -> str:
     shading = package / "kernels" / "shading"
     code += [shading / "materials.py", shading / "shadow_maps.py"]
     where = device.partition(":")[0]
-    return disk_cache.source_digest(*code, f"{model.digest()} {grass!r} {berries.VARIETIES!r}", where)
+    return disk_cache.source_digest(
+        *code, f"{model.digest()} {grass!r} {berries.VARIETIES!r} {model.fruit_look!r}", where
+    )
 
 
 def rest_snapshot(model: Model, visuals: tuple[RigidVisual, ...] = (), visual_q: np.ndarray | None = None) -> Snapshot:

@@ -60,8 +60,7 @@ def _grid(side: int) -> tuple[np.ndarray, np.ndarray]:
 
 def leaf_scale(shape: int | np.ndarray) -> np.ndarray:
     """Returns the length from petiole to tip, in units of ``Model.leaf_size``, of leaves with outline ``shape``."""
-    tips = np.array([leaves.blade_outline(np.zeros(1), i)[0] for i in range(leaves.SHAPE_COUNT)])
-    return tips[shape]
+    return np.array([leaves.midrib_length(i) for i in range(leaves.SHAPE_COUNT)])[shape]
 
 
 def _signed_distance(mask: np.ndarray) -> np.ndarray:
@@ -126,7 +125,10 @@ def _leaf_outlines() -> disk_cache.Arrays:
     knots = np.linspace(-np.pi, np.pi, 8193)
     for shape in range(leaves.SHAPE_COUNT):
         edge = leaves.blade_outline(knots, shape) / leaf_scale(shape)
-        table[shape] = _signed_distance(radius < np.interp(theta, knots, edge))
+        blade = radius < np.interp(theta, knots, edge)
+        for hole_u, hole_v, wide in leaves.blade_holes(shape):
+            blade &= np.hypot(u - hole_u, v - hole_v) > wide
+        table[shape] = _signed_distance(blade)
     table[GRASS_OUTLINE] = _signed_distance(_grass_mask())
     table[HERB_OUTLINE] = _signed_distance((u / 0.42) ** 2 + ((v - 0.45) / 0.55) ** 2 < 1.0)
     table[CLUMP_OUTLINE] = _signed_distance(_clump_mask())
@@ -163,26 +165,35 @@ def _leaf_texture() -> disk_cache.Arrays:
     for shape in range(leaves.SHAPE_COUNT):
         rng = np.random.default_rng(71 + shape)
         vein = np.zeros_like(u)
-        crease = np.zeros_like(u)
-        for angle, length in ((0.0, 1.0), (54.0, 0.86), (-54.0, 0.86), (112.0, 0.62), (-112.0, 0.62)):
+        away_from_vein = np.full_like(u, 1.0)
+        for angle, length in ((0.0, 1.0), (52.0, 0.90), (-52.0, 0.90), (112.0, 0.72), (-112.0, 0.72)):
             turn = np.radians(angle)
             tip = length * np.array([np.sin(turn), np.cos(turn)])
             away, along = _segment(u, v, np.zeros(2), tip)
-            vein = np.maximum(vein, np.exp(-((away / (0.021 * (1.0 - 0.7 * along))) ** 2)))
-            crease += 0.03 * np.exp(-((away / 0.05) ** 2))
-            for start in np.linspace(0.15, 0.88, 7):
+            vein = np.maximum(vein, np.exp(-((away / (0.017 * (1.0 - 0.7 * along))) ** 2)))
+            away_from_vein = np.minimum(away_from_vein, away)
+            for start in np.linspace(0.14, 0.88, 6) + rng.normal(0.0, 0.015, 6):
                 for side in (1.0, -1.0):
-                    root = (start + 0.04 * side) * tip
-                    out = turn + side * np.radians(50.0)
-                    reach = 0.55 * length * (1.0 - 0.7 * abs(start - 0.35))
-                    away, along = _segment(u, v, root, root + reach * np.array([np.sin(out), np.cos(out)]))
-                    vein = np.maximum(vein, 0.75 * np.exp(-((away / (0.012 * (1.0 - 0.6 * along))) ** 2)))
-                    crease += 0.009 * np.exp(-((away / 0.03) ** 2))
+                    root = (start + 0.05 * side) * tip
+                    out = turn + side * np.radians(48.0 + rng.normal(0.0, 4.0))
+                    bent = turn + side * np.radians(34.0)  # secondary veins bend towards the tip
+                    reach = 0.5 * length * (1.0 - 0.7 * abs(start - 0.35))
+                    knee = root + 0.5 * reach * np.array([np.sin(out), np.cos(out)])
+                    end = knee + 0.5 * reach * np.array([np.sin(bent), np.cos(bent)])
+                    for first, last, wide in ((root, knee, 0.010), (knee, end, 0.007)):
+                        away, along = _segment(u, v, first, last)
+                        vein = np.maximum(vein, 0.55 * np.exp(-((away / (wide * (1.0 - 0.3 * along))) ** 2)))
+                        away_from_vein = np.minimum(away_from_vein, away)
         fine = _smooth_noise(rng, 3.0)
-        wide = _smooth_noise(rng, 8.0)
+        wide = _smooth_noise(rng, 9.0)
         net = np.exp(-((fine / 0.25) ** 2))  # areoles: where a band-limited noise crosses zero
-        slope_v, slope_u = np.gradient(0.010 * wide + 0.004 * fine - crease, 2.0 / TEXTURE_SIZE)
-        table[shape] = np.stack([np.maximum(vein, 0.25 * net), slope_u, slope_v, 0.5 + 0.2 * wide + 0.12 * fine], -1)
+        puffed = 1.0 - np.exp(-((away_from_vein / 0.07) ** 2))  # the blade rises between its veins
+        height = 0.008 * puffed + 0.010 * wide + 0.0015 * fine
+        slope_v, slope_u = np.gradient(height, 2.0 / TEXTURE_SIZE)
+        tone = 0.5 + 0.14 * wide + 0.07 * fine
+        for spot_u, spot_v, size in rng.uniform((-0.7, -0.4, 0.008), (0.7, 0.8, 0.03), (6 * (shape % 4 > 1), 3)):
+            tone -= 1.3 * np.exp(-((np.hypot(u - spot_u, v - spot_v) / size) ** 4))  # spots of blight
+        table[shape] = np.stack([np.maximum(vein, 0.15 * net), slope_u, slope_v, tone], -1)
     table[GRASS_OUTLINE, ..., 3] = 0.5 + 0.5 * v
     table[HERB_OUTLINE, ..., 0] = 0.6 * np.exp(-((u / 0.03) ** 2))
     table[HERB_OUTLINE, ..., 3] = 0.5

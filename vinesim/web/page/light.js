@@ -132,11 +132,12 @@ const uint SKIN = 9u, PAINT = 10u, GRASS = 11u, LAMP = 12u, RUBBER = 13u, METAL 
 export const BERRIES = /* glsl */ `
 Surface berry(vec3 n, vec3 tint, float sky, vec3 local, vec4 neighbours) {
   Surface s = diffuse(n, tint, sky);
-  s.occlusion = clamp(1.0 - neighbours.w - dot(neighbours.xyz, n), 0.12, 1.0) * (0.4 + 0.6 * local.y);
-  float pale = clamp(tint.y * 2.2, 0.0, 1.0), red = clamp((tint.x - tint.y) * 4.0, 0.0, 1.0) * (1.0 - pale);
+  float pale = clamp(tint.y * 2.2, 0.0, 1.0);
+  s.occlusion = clamp(1.0 - neighbours.w - dot(neighbours.xyz, n), 0.12 + 0.2 * pale, 1.0) * (0.4 + 0.6 * local.y);
+  float red = clamp((tint.x - tint.y) * 4.0, 0.0, 1.0) * (1.0 - pale);
   s.wrap = vec3(0.12, 0.06, 0.08) + vec3(0.33, 0.34, 0.12) * pale + vec3(0.2, 0.05, 0.02) * red;
-  s.transmission = vec3(0.95, 0.76, 0.12) * pale + vec3(0.26, 0.03, 0.012) * red + vec3(0.03, 0.003, 0.004);
-  float bloom = 0.46 - 0.32 * pale - 0.10 * red, seed = local.x;
+  s.transmission = tint * 1.8 * pale + vec3(0.26, 0.03, 0.012) * red + vec3(0.03, 0.003, 0.004);
+  float bloom = 0.36 - 0.22 * pale - 0.06 * red, seed = local.x;
   vec4 wide = noiseAt(vec2(n.x * 0.20 + seed * 7.1, n.y * 0.20 + n.z * 0.31 + seed * 3.3));
 #ifdef PLAIN
   vec4 fine = wide.zwxy;
@@ -144,15 +145,16 @@ Surface berry(vec3 n, vec3 tint, float sky, vec3 local, vec4 neighbours) {
   vec4 fine = noiseAt(vec2(n.x * 1.1 + n.z * 0.6 + seed, n.y * 1.1 - n.z * 0.4));
 #endif
   s.albedo *= 0.86 + 0.28 * wide.y;
-  s.albedo = mix(s.albedo, vec3(0.46, 0.30, 0.06), pale * 0.35 * smoothstep(0.5, 0.8, wide.x + 0.15 * n.z));
+  float amber = pale * 0.35 * clamp(8.0 * (tint.x / tint.y - 0.8), 0.0, 1.0);
+  s.albedo = mix(s.albedo, vec3(0.46, 0.30, 0.06), amber * smoothstep(0.5, 0.8, wide.x + 0.15 * n.z));
   s.albedo *= 1.0 + pale * (0.14 * fine.z - 0.07) + red * 0.22 * step(0.82, fine.w);
   float dusty = bloom * smoothstep(0.30, 0.62, wide.x * 0.55 + wide.y * 0.45 + 0.12 * n.z) * (0.75 + 0.5 * fine.y);
   s.albedo = mix(s.albedo, vec3(0.07, 0.045, 0.025), smoothstep(0.986, 0.994, local.z));
   s.albedo = mix(s.albedo, vec3(0.16, 0.18, 0.06), 0.7 * (1.0 - smoothstep(-0.985, -0.95, local.z)));
-  s.albedo = mix(s.albedo, vec3(0.40, 0.43, 0.60), clamp(dusty, 0.0, 0.8));
+  s.albedo = mix(s.albedo, vec3(0.40, 0.43, 0.60) + vec3(0.0, 0.04, -0.36) * pale, clamp(dusty, 0.0, 0.8));
   s.specular = 0.045;
-  s.shininess = 260.0 - 300.0 * min(dusty, 0.75);
-  s.reflectivity = 1.0 - min(dusty * 1.6, 0.85);
+  s.shininess = 70.0 - 72.0 * min(dusty, 0.75);
+  s.reflectivity = 0.6 * (1.0 - min(dusty * 1.6, 0.85));
   return s;
 }
 `;

@@ -16,7 +16,7 @@ uniform sampler2D shapes;     // four texels a primitive: a b c d
 uniform usampler2D surfaces;  // one texel a primitive: colour and sky in bytes, material, carrier
 uniform mat4 projectionMatrix;
 uniform mat4 modelViewMatrix;
-uniform float leafExtent[28]; // of each outline: largest |u|, lowest and highest v, unused
+uniform float leafExtent[64]; // of each outline: largest |u|, lowest and highest v, unused
 uniform usampler2D listed;    // rows of the primitives that are drawn; largest number: none
 uniform int copies;           // of the mesh in an instance
 uniform vec3 eye;

@@ -142,9 +142,9 @@ export class World {
 
   makeMeshes(arrays) {
     const { header } = this;
-    const count = arrays.hull.length / 16; // outlines of leaves
-    const extent = new Float32Array(4 * count);
-    for (let k = 0; k < count; ++k) {
+    const outlineCount = arrays.hull.length / 16; // at most 16: leafExtent of the shaders
+    const extent = new Float32Array(64);
+    for (let k = 0; k < outlineCount; ++k) {
       const hull = arrays.hull.subarray(16 * k, 16 * k + 16);
       const at = (corner, axis) => hull[2 * corner + axis];
       extent.set([Math.max(Math.abs(at(1, 0)), Math.abs(at(5, 0))), at(3, 1), at(7, 1), 0], 4 * k);
@@ -153,7 +153,7 @@ export class World {
       Uint8Array.from(arrays.outline, (x) => x + 128),
       256,
       256,
-      count,
+      outlineCount,
     );
     outlines.format = THREE.RedFormat;
     outlines.minFilter = outlines.magFilter = THREE.LinearFilter;
@@ -166,7 +166,7 @@ export class World {
     this.sunCamera = new THREE.OrthographicCamera(-SUN_REACH, SUN_REACH, SUN_REACH, -SUN_REACH, SUN_NEAR, SUN_FAR);
     const noises = smoothTable(new THREE.DataTexture(arrays.noise, 256, 256, THREE.RGBAFormat));
     noises.wrapS = noises.wrapT = THREE.RepeatWrapping;
-    const leaves = smoothTable(new THREE.DataArrayTexture(arrays.leaf, 128, 128, count));
+    const leaves = smoothTable(new THREE.DataArrayTexture(arrays.leaf, 128, 128, outlineCount));
     const common = {
       eye: { value: this.eye },
       sun: { value: new THREE.Vector3(...header.sun) },
