@@ -20,6 +20,7 @@ import numpy as np
 from vinesim.core import frames
 from vinesim.core.array_fields import StructOfArrays, array
 from vinesim.scene.ids import Organ
+from vinesim.scene.palette import DEFAULT, Palette
 from vinesim.scene.terrain import Terrain
 
 _UNIT_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
@@ -144,10 +145,12 @@ class Model(StructOfArrays):
 
     terrain: Terrain | None = None
     """The uneven ground; None: the plane z = 0."""
+    palette: Palette = DEFAULT
+    """Colours for sensors. They are not part of the digest."""
 
     def copy(self) -> Model:
-        """Returns a deep copy of the arrays, with the same terrain."""
-        return dataclasses.replace(super().copy(), terrain=self.terrain)
+        """Returns a deep copy of the arrays, with the same terrain and palette."""
+        return dataclasses.replace(super().copy(), terrain=self.terrain, palette=self.palette)
 
     def digest(self) -> str:
         """Returns a hash of all arrays (16 hex digits): two clients with equal digests hold the same vineyard."""

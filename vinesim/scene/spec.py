@@ -21,6 +21,7 @@ from vinesim.core.geodesy import APRILIA, Geodetic
 from vinesim.core.toml_loader import DataError, load_toml
 from vinesim.scene import plant_parameters
 from vinesim.scene.berries import VARIETIES
+from vinesim.scene.palette import PaletteTable, resolve
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.plant_import.imported_plant import load_imported_plant
 
@@ -230,6 +231,8 @@ class Scene(_Part, frozen=True, kw_only=True):
     terrain: TerrainTable | None = None
     """Uneven ground; the plane z = 0 unless given."""
     season: Season = Season()
+    palette: PaletteTable = PaletteTable()
+    """Colours of leaves, wood, ground and sky. They are not part of the vineyard's digest."""
     fruit: Fruit
     boxes: tuple[Box, ...] = ()
     imported: tuple[Imported, ...] = ()
@@ -292,6 +295,10 @@ def _find_error(scene: Scene) -> str:
         plant_parameters.load_plant(scene.plants)
     except (DataFileNotFound, DataError) as bad:
         return f"plants is {scene.plants!r}; {bad}"
+    try:
+        resolve(scene)
+    except DataError as bad:
+        return f"palette.name is {scene.palette.name!r}; {bad}"
     for i, one in enumerate(scene.imported):
         try:
             load_imported_plant(one.file)

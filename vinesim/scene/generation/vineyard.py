@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from vinesim.core import array_fields, disk_cache, frames, portable_math
-from vinesim.scene import berries, builder, leaves, plant_parameters
+from vinesim.scene import berries, builder, leaves, palette, plant_parameters
 from vinesim.scene.generation.fixed_structure import FixedStructure, build_fixed_structure
 from vinesim.scene.generation.plant_bodies import Bodies, build_bodies, place_leaves
 from vinesim.scene.generation.shoot_slots import CORE_SLOTS, MAX_BUNCHES, cluster_slots, peduncle_slots
@@ -56,6 +56,7 @@ def generate(scene: Scene) -> Model:
     plants = msgspec.structs.replace(
         scene,
         name="",
+        palette=palette.PaletteTable(),
         sun=Sun(),
         wind=Wind(),
         datum=Datum(),
@@ -71,7 +72,8 @@ def generate(scene: Scene) -> Model:
     )
     imported = [(load_imported_plant(one.file), msgspec.structs.replace(one, file="")) for one in scene.imported]
     digest = disk_cache.source_digest(_code_digest(), msgspec.json.encode((plants, parameters, imported, ground)))
-    return Model(terrain=terrain, **disk_cache.load_or_make("vineyard", digest, make)).check()
+    colours = palette.resolve(scene)
+    return Model(terrain=terrain, palette=colours, **disk_cache.load_or_make("vineyard", digest, make)).check()
 
 
 def generate_uncached(scene: Scene) -> Model:
@@ -107,6 +109,7 @@ def _generate(scene: Scene, parameters: VineParameters, terrain: Terrain | None)
             half = 0.5 * box.size[0], 0.5 * box.size[1]
             model.box_pose[i] = terrain.resting_pose(box.x, box.y, box.yaw, half)
     model = builder.solve_rest_pose(model).check()
+    model.palette = palette.resolve(scene)
     variety = [v.name for v in berries.VARIETIES].index(scene.fruit.varieties[0])
     for number, one in enumerate(scene.imported):
         foot = one.z + float(ground_height(terrain, one.x, one.y))
