@@ -392,6 +392,12 @@ def _times(a: Rgb, factor: float | Rgb) -> Rgb:
     return _rounded(x * f for x, f in zip(a, factors, strict=True))
 
 
+_WARMTH = 0.45
+"""How much yellower light through a leaf is than light from it, relative to the default palette."""
+_BOUNCE = 0.7
+"""Exponent by which the light from the ground follows its reflectance: a part of the ground is in shade."""
+
+
 # What a file does not give is derived from what it gives, in the ratios of the default palette: GUESSED.
 
 
@@ -402,10 +408,13 @@ def _leaf(drawn: dict[str, typing.Any]) -> LeafColours:
     if "grown" in drawn:
         grown = drawn["grown"]
         drawn.setdefault("young", grown)
-        drawn["pale"] = _times(drawn["young"], 0.28)
+        drawn["pale"] = _times(_mixed(grown, drawn["young"], 0.2), 0.4)
         hue, saturation, value = to_hsv(grown)
+        # light through a leaf is yellower than light from it, least for a blue green leaf
+        warmth = _WARMTH * min(max((140.0 - hue) / 50.0, 0.0), 1.0)
+        drawn["through"] = _mixed((2.0, 2.0, 2.0), usual.through, warmth)
         # veins are yellower and paler than the blade
-        drawn["vein"] = from_hsv(hue + 0.15 * (70.0 - hue), 0.75 * saturation, min(1.5 * value, 0.75))
+        drawn["vein"] = from_hsv(hue + 0.05 * (70.0 - hue), 0.75 * saturation, min(1.5 * value, 0.75))
         brighter = [min(max((new / old) ** 0.5, 0.4), 2.5) for new, old in zip(grown, usual.grown, strict=True)]
         drawn["shade"] = _times(usual.shade, _rounded(brighter))
     if "under" in drawn:
@@ -446,7 +455,7 @@ def _ground(drawn: dict[str, typing.Any]) -> GroundColours:
     if "dry" in drawn:
         drawn["weathered"] = _times(drawn["dry"], 0.3)
     colours = GroundColours(**drawn)
-    ratio = [new / old for new, old in zip(_mean(colours, share), _mean(usual, 0.5), strict=True)]
+    ratio = [(new / old) ** _BOUNCE for new, old in zip(_mean(colours, share), _mean(usual, 0.5), strict=True)]
     return msgspec.structs.replace(colours, bounce=_times(usual.bounce, _rounded(ratio)))
 
 

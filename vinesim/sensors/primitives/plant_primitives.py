@@ -17,8 +17,8 @@ from vinesim.sensors.raster.primitive_arrays import CONE, LEAF
 
 STEM_TINT = DEFAULT.wood.stem
 """Colour [linear RGB reflectance] of the rachis and the stalks of berries."""
-_YOUNG = 0.22
-_YOUNGEST = 0.05
+_YOUNG = 0.15
+_YOUNGEST = 0.03
 """Ages (:attr:`Model.leaf_age`) between which a leaf's colour changes from young to grown. GUESSED."""
 _TURNED = 0.62
 """Age from which a leaf counts as one that the season has turned yellow."""
