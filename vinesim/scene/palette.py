@@ -10,9 +10,7 @@ wood, ground and sky from four palettes that its seed chooses.
 from __future__ import annotations
 
 import colorsys
-import functools
 import math
-import pathlib
 import typing
 import zlib
 from typing import Annotated, Protocol
@@ -213,13 +211,13 @@ class GroundRanges(_Ranges, frozen=True, kw_only=True):
     turf_light: Tone | None = None
     dry: Tone | None = None
     straw: Tone | None = None
-    litter: Tone | None = None
+    litter_brown: Tone | None = None
     cover: Annotated[Range, "1", (0.0, 1.0)] | None = None
     """Share of the vineyard's ground that is covered with sod."""
     strip: Annotated[Range, "1", (-2.0, 2.0)] | None = None
     dry_share: Annotated[Range, "1", (0.0, 1.0)] | None = None
     straw_share: Annotated[Range, "1", (0.0, 1.0)] | None = None
-    litter_amount: Annotated[Range, "1", (0.0, 4.0)] | None = None
+    litter: Annotated[Range, "1", (0.0, 4.0)] | None = None
 
 
 class SkyRanges(_Ranges, frozen=True, kw_only=True):
@@ -295,12 +293,7 @@ def load_palette(name: str) -> PaletteRanges:
     except DataFileNotFound:
         known = ", ".join((ANY_NAME, *palette_names()))
         raise DataError(f"no palette {name!r}; give the path of a file or one of: {known}") from None
-    return _load_file(str(path), path.stat().st_mtime_ns)
-
-
-@functools.lru_cache(maxsize=64)
-def _load_file(path: str, _changed: int) -> PaletteRanges:
-    ranges = load_toml(pathlib.Path(path), PaletteRanges)
+    ranges = load_toml(path, PaletteRanges)
     for part in ranges.__struct_fields__:
         _check(getattr(ranges, part), f"{path}: {part}")
     return ranges
@@ -446,12 +439,8 @@ def _ground(drawn: dict[str, typing.Any]) -> GroundColours:
         dark = drawn.setdefault("turf_dark", _times(drawn["turf_light"], 0.35))
         drawn["field"] = _mixed(dark, drawn["turf_light"], 0.25)
         drawn["grass"] = _mixed(dark, drawn["turf_light"], 0.55)
-    if "litter" in drawn:
-        brown = drawn.pop("litter")
-        drawn["litter_brown"] = brown
-        drawn["litter_pale"] = _times(brown, (1.8, 2.0, 1.4))
-    if "litter_amount" in drawn:
-        drawn["litter"] = drawn.pop("litter_amount")
+    if "litter_brown" in drawn:
+        drawn["litter_pale"] = _times(drawn["litter_brown"], (1.8, 2.0, 1.4))
     if "dry" in drawn:
         drawn["weathered"] = _times(drawn["dry"], 0.3)
     colours = GroundColours(**drawn)

@@ -388,6 +388,20 @@ def load_heights(table: TerrainTable) -> np.ndarray:
     return low + (high - low) * (pixels[::-1].astype(float) / white)
 
 
+def with_palette(scene: Scene, name: str, seed: int | None = None) -> Scene:
+    """Returns a copy of the scene with the palette ``name``, drawn with ``seed`` (by default the scene's).
+
+    Raises :class:`SceneError` if the palette does not exist or cannot be used.
+    """
+    table = PaletteTable(name=name, seed=seed)
+    changed = msgspec.structs.replace(scene, palette=table)
+    try:
+        resolve(changed)
+    except DataError as bad:
+        raise SceneError(str(bad)) from None
+    return changed
+
+
 def with_seed(scene: Scene, seed: int | None) -> Scene:
     """Returns a copy of the scene with the given seed; None keeps the scene's own seed."""
     if seed is None:

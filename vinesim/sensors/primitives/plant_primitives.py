@@ -84,7 +84,7 @@ def _turn_hue(linear: np.ndarray, turn: np.ndarray) -> np.ndarray:
     return np.where(turned <= 0.04045, turned / 12.92, ((turned + 0.055) / 1.055) ** 2.4)
 
 
-def _shown_age(colours: LeafColours, age: np.ndarray) -> np.ndarray:
+def shown_age(colours: LeafColours, age: np.ndarray) -> np.ndarray:
     """Returns the age [leaf] up to which leaves of ``age`` [leaf] show margins: leaves that the season has not turned
     yellow have fewer of them where the palette says so."""
     return age - (1.0 - colours.margins) * np.maximum(age - _UNTURNED, 0.0) * (age < _TURNED)
@@ -113,7 +113,7 @@ def leaf_batches(model: Model) -> list[Batch]:
         stack_columns(petiole_end, size),
         b=stack_columns(rib, shape),
         c=stack_columns(up, rng.uniform(size=count)),
-        d=stack_columns(bend, _shown_age(colours, model.leaf_age)),
+        d=stack_columns(bend, shown_age(colours, model.leaf_age)),
         material=int(materials.FOLIAGE),
         tint=tint,
         organ=int(Organ.LEAF),
