@@ -385,7 +385,7 @@ def _times(a: Rgb, factor: float | Rgb) -> Rgb:
     return _rounded(x * f for x, f in zip(a, factors, strict=True))
 
 
-_WARMTH = 0.45
+_WARMTH = 0.4
 """How much yellower light through a leaf is than light from it, relative to the default palette."""
 _BOUNCE = 0.7
 """Exponent by which the light from the ground follows its reflectance: a part of the ground is in shade."""
