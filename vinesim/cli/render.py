@@ -62,6 +62,7 @@ def run(
     people: Sequence[str] = (),
     crates: Sequence[str] = (),
     hour: float | None = None,
+    palette: str | None = None,
     time: float = 0.0,
     device: str = "cpu",
     sensors: Sequence[str] = (),
@@ -85,9 +86,11 @@ def run(
     info = resized_intrinsics(spec, pixels)
     mounts = parse_sensors(sensors, pixels)
     staged = parse_composition(robots, people, crates)
-    from vinesim.scene.spec import load_scene, with_seed
+    from vinesim.scene.spec import load_scene, with_palette, with_seed
 
     plan = with_seed(load_scene(scene), seed)
+    if palette is not None:
+        plan = with_palette(plan, palette)
     if hour is not None:
         plan = msgspec.structs.replace(plan, sun=msgspec.structs.replace(plan.sun, hour=hour))
     actors = {"robots": list(robots), "people": list(people), "crates": list(crates)}

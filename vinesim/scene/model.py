@@ -20,6 +20,7 @@ import numpy as np
 from vinesim.core import frames
 from vinesim.core.array_fields import StructOfArrays, array
 from vinesim.scene.ids import Organ
+from vinesim.scene.palette import DEFAULT, Palette
 from vinesim.scene.spec import Clutter
 from vinesim.scene.terrain import Terrain
 
@@ -164,15 +165,18 @@ class Model(StructOfArrays):
     """Seed of the clutter: the scene's."""
     fruit_look: FruitLook | None = None
     """Visible state of the fruit; None: all fruit is ripe and sound. It is not part of the digest."""
+    palette: Palette = DEFAULT
+    """Colours for sensors. They are not part of the digest."""
 
     def copy(self) -> Model:
-        """Returns a deep copy of the arrays, with the same terrain, clutter and look of the fruit."""
+        """Returns a deep copy of the arrays, with the same terrain, clutter, look of the fruit and palette."""
         return dataclasses.replace(
             super().copy(),
             terrain=self.terrain,
             clutter=self.clutter,
             clutter_seed=self.clutter_seed,
             fruit_look=self.fruit_look,
+            palette=self.palette,
         )
 
     def digest(self) -> str:

@@ -21,6 +21,7 @@ from vinesim.core.geodesy import APRILIA, Geodetic
 from vinesim.core.toml_loader import DataError, load_toml
 from vinesim.scene import plant_parameters
 from vinesim.scene.berries import VARIETIES
+from vinesim.scene.palette import PaletteTable, resolve
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.plant_import.imported_plant import load_imported_plant
 
@@ -270,6 +271,8 @@ class Scene(_Part, frozen=True, kw_only=True):
     """Uneven ground; the plane z = 0 unless given."""
     season: Season = Season()
     clutter: Clutter = Clutter()
+    palette: PaletteTable = PaletteTable()
+    """Colours of leaves, wood, ground and sky. They are not part of the vineyard's digest."""
     fruit: Fruit
     boxes: tuple[Box, ...] = ()
     imported: tuple[Imported, ...] = ()
@@ -334,6 +337,10 @@ def _find_error(scene: Scene) -> str:
         plant_parameters.load_plant(scene.plants)
     except (DataFileNotFound, DataError) as bad:
         return f"plants is {scene.plants!r}; {bad}"
+    try:
+        resolve(scene)
+    except DataError as bad:
+        return f"palette.name is {scene.palette.name!r}; {bad}"
     for i, one in enumerate(scene.imported):
         try:
             load_imported_plant(one.file)
@@ -421,6 +428,20 @@ def load_heights(table: TerrainTable) -> np.ndarray:
     white = 255.0 if mode == "L" else 65535.0
     low, high = table.range
     return low + (high - low) * (pixels[::-1].astype(float) / white)
+
+
+def with_palette(scene: Scene, name: str, seed: int | None = None) -> Scene:
+    """Returns a copy of the scene with the palette ``name``, drawn with ``seed`` (by default the scene's).
+
+    Raises :class:`SceneError` if the palette does not exist or cannot be used.
+    """
+    table = PaletteTable(name=name, seed=seed)
+    changed = msgspec.structs.replace(scene, palette=table)
+    try:
+        resolve(changed)
+    except DataError as bad:
+        raise SceneError(str(bad)) from None
+    return changed
 
 
 def with_seed(scene: Scene, seed: int | None) -> Scene:

@@ -108,6 +108,9 @@ def render(
     hour: Annotated[
         float | None, typer.Option(min=0.0, max=24.0, help="Solar time [h], instead of the scene's own sun.")
     ] = None,
+    palette: Annotated[
+        str | None, typer.Option(help="Colours of the vineyard: a palette's name or file, instead of the scene's own.")
+    ] = None,
     time: Annotated[float, typer.Option(min=0.0, help="Simulated time [s]; determines wind and sun.")] = 0.0,
     out: Annotated[pathlib.Path, typer.Option(help="Folder for the picture and its ground truth.")] = pathlib.Path(
         "render"
@@ -151,6 +154,7 @@ def render(
         path=path,
         size=size,
         hour=hour,
+        palette=palette,
         time=time,
         seed=seed,
         out=out,

@@ -23,11 +23,13 @@ from vinesim.rigid.human_posture import SIDES
 from vinesim.scene.appearance import load_human_model, load_shears
 from vinesim.scene.ids import Organ, object_name
 from vinesim.scene.model import Model
+from vinesim.scene.palette import Palette
 from vinesim.scene.terrain import Terrain
 from vinesim.scene.values import INTENTIONS, CameraMount, Contact, Haptic, RigidVisual, SegmentPoses, Snapshot
 from vinesim.sensors.camera.exposure import usual_exposure
 from vinesim.sensors.camera.sunlight import OutdoorLight
 from vinesim.sensors.primitives import textures
+from vinesim.sensors.primitives.palette_colours import shared_colours
 from vinesim.sensors.primitives.scene_primitives import Primitives
 from vinesim.sensors.primitives.static_primitives import row_layout
 from vinesim.sensors.sensor import load_kernels
@@ -252,7 +254,8 @@ class PageWorld:
                 "scene": scene.name,
                 "seed": scene.seed,
                 "sun": list(sun),
-                "light": _light(sun[2]),
+                "light": _light(sun[2], model.palette),
+                "palette": shared_colours(model.palette) | msgspec.structs.asdict(model.palette.sky),
                 "rows": list(row_layout(model)),
                 "room": min(primitives.plant_count, self._most),
                 "reach": reach,
@@ -468,10 +471,10 @@ def _terrain_grid(terrain: Terrain | None) -> tuple[dict[str, Any] | None, np.nd
     return {"x": x, "y": y, "cell": cell, "columns": nodes.shape[1], "slope": list(terrain.slope)}, nodes.ravel()
 
 
-def _light(height: float) -> dict[str, Any]:
+def _light(height: float, palette: Palette) -> dict[str, Any]:
     """Returns the daylight for pages, as JSON values: colours (linear RGB), brightness and exposure, equal to those of
-    cameras. ``height``: sine of the sun's elevation [1]."""
-    light = OutdoorLight.of(height)
+    cameras. ``height``: sine of the sun's elevation [1]; ``palette``: colours of the vineyard."""
+    light = OutdoorLight.of(height, palette)
     colours = {name: getattr(light, name).tolist() for name in ("sun", "sky", "haze", "ground", "canopy", "balance")}
     return colours | {"dim": light.dim, "exposure": AMONG_VINES * usual_exposure(light.brightness)}
 

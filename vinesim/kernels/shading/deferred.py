@@ -48,6 +48,8 @@ class Light:
     canopy_colour: wp.vec3
     """Linear RGB of the green light that leaves transmit."""
     haze_colour: wp.vec3
+    haze_rate: float
+    """Rate [1/m] at which surfaces fade into the haze with distance."""
     shadow_taps: int
     """Number of samples of the shadow map for each pixel; 0 means a smooth filter of two widths, -1 of one width."""
     sample_spiral: wp.array(dtype=wp.vec2)
@@ -214,7 +216,7 @@ def shade_surface(
     if s.specular > 0.0:
         colour += specular_light(materials, light, s, kind, d, n, ndl, lit)
     colour += s.albedo * s.emission
-    return mix(colour, light.haze_colour, 0.6 * (1.0 - wp.exp(-t * 0.006)))
+    return mix(colour, light.haze_colour, 0.6 * (1.0 - wp.exp(-t * light.haze_rate)))
 
 
 @wp.func

@@ -15,13 +15,6 @@ from vinesim.kernels.shading.shadow_maps import ShadowMap
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-SOIL_RATIO = wp.constant(0.72)
-SOD_RATIO = wp.constant(1.45)
-"""Ratio of green to red albedo of the ground: up to SOIL_RATIO the ground is bare soil, from SOD_RATIO on it is sod.
-
-Between the values the share of sod is linear in the ratio. GUESSED.
-"""
-
 
 @wp.func
 def grey(colour: wp.vec3) -> float:
@@ -77,7 +70,8 @@ def illuminate_pixels(
             through = float(0.0)
             if i == -2:
                 ratio = s.albedo[1] / wp.max(s.albedo[0], 1.0e-6)
-                sod = wp.clamp((ratio - SOIL_RATIO) / (SOD_RATIO - SOIL_RATIO), 0.0, 1.0)
+                bare = materials.colours.soil_ratio
+                sod = wp.clamp((ratio - bare) / (materials.colours.sod_ratio - bare), 0.0, 1.0)
             elif shapes.kind[i] == LEAF:
                 through = transmission
                 if wp.dot(plain, d) > 0.0:

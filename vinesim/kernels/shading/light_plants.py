@@ -22,7 +22,16 @@ from vinesim.kernels.shading.light_points import (
     sun_share,
     unit,
 )
-from vinesim.kernels.shading.materials import GRASS, Materials, mix, row_greenness, smoothstep
+from vinesim.kernels.shading.materials import (
+    GRASS,
+    Colours,
+    Materials,
+    dry_cover,
+    mix,
+    row_greenness,
+    smoothstep,
+    straw_cover,
+)
 
 wp.set_module_options({"enable_backward": False, "fast_math": True, "cpu_compiler_flags": INLINE_ALL})
 
@@ -82,7 +91,9 @@ def sampled(table: wp.array2d(dtype=wp.float32), t: Texels, channel: int) -> flo
 
 
 @wp.func
-def autumn_colour(tables: FloatTables, albedo: wp.vec3, i: int, u: float, v: float, share: float) -> wp.vec3:
+def autumn_colour(
+    tables: FloatTables, colours: Colours, albedo: wp.vec3, i: int, u: float, v: float, share: float
+) -> wp.vec3:
     """Returns the albedo of leaf ``i`` at (u, v) [leaf units] in autumn: yellow from the edge inwards, then brown.
 
     ``share`` (0 to 1) is the weight of the autumn colour; 0 returns ``albedo`` unchanged.
@@ -99,7 +110,7 @@ def autumn_colour(tables: FloatTables, albedo: wp.vec3, i: int, u: float, v: flo
     yellow += 0.7 * smoothstep(0.62, 0.9, age) * tables.noise[at, 0]
     yellow = wp.where(age > 0.02, wp.clamp(yellow, 0.0, 1.0), 0.0)
     brown = smoothstep(0.03, 0.0, edge - 0.05 * tables.noise[at, 2] * age) * smoothstep(0.35, 0.6, age)
-    return mix(mix(albedo, wp.vec3(0.40, 0.34, 0.05), yellow), wp.vec3(0.16, 0.085, 0.03), brown)
+    return mix(mix(albedo, colours.margin, yellow), colours.scorch, brown)
 
 
 @wp.func
@@ -164,16 +175,17 @@ def blade_light(
     tone = 1.0 + near * (sampled(tables.leaf_texture, t, 3) * 0.5 - 0.28)
     tone = wp.where(grass > 0.5, 0.35 + 0.75 * (0.5 + 0.5 * v), tone)
     albedo = row3(tables.tint, i) * tone
-    albedo = autumn_colour(tables, albedo, i, u, v, 1.0 - grass)
-    passing = mix(wp.vec3(2.3, 2.0, 0.75) * (1.0 - 0.7 * vein), wp.vec3(0.7, 0.7, 0.7), grass)
+    colours = materials.colours
+    albedo = autumn_colour(tables, colours, albedo, i, u, v, 1.0 - grass)
+    passing = mix(colours.through * (1.0 - 0.7 * vein), wp.vec3(0.7, 0.7, 0.7), grass)
     transmission = wp.cw_mul(albedo, passing)
     # the lower side is paler, felted, with raised veins
     under = wp.where(wp.dot(plain, d) > 0.0, 1.0, 0.0)
     below = under * (1.0 - grass)
     above = (1.0 - under) * (1.0 - grass)
-    felt = mix(albedo * 1.05, wp.vec3(0.22, 0.27, 0.16), 0.42)
-    albedo = mix(mix(albedo, felt, below), wp.vec3(0.34, 0.38, 0.20), below * vein * 0.7)
-    albedo = mix(albedo, wp.vec3(0.20, 0.28, 0.08), above * vein * 0.40)
+    felt = mix(albedo * 1.05, colours.under, 0.42)
+    albedo = mix(mix(albedo, felt, below), colours.under_vein, below * vein * 0.7)
+    albedo = mix(albedo, colours.vein, above * vein * 0.40)
     specular = 0.012 + 0.038 * above
     shininess = 12.0 - 6.0 * below + 10.0 * above
     occlusion = wp.where(grass > 0.5, 0.35 + 0.65 * smoothstep(-0.75, 0.0, v), 1.0)
@@ -296,18 +308,20 @@ def soil_light(
     sky = wp.where(within, low * (1.0 - fy) + above * fy, 0.75)
     edge = wp.min(wp.min(x, wide - x), wp.min(y, high - y)) * materials.ground_cell
     inside = wp.where(within, smoothstep(0.0, 3.0, edge), 0.0)
-    green = 0.85 * smoothstep(
-        0.38,
-        0.60,
-        0.55 * coarse + 0.2 * spots + 0.25 * sod + row_greenness(materials.rows, p[1]) * inside * blur,
+    colours = materials.colours
+    lanes = row_greenness(materials.rows, p[1]) * inside * blur * colours.strip
+    green = colours.most_cover * smoothstep(
+        0.38, 0.60, 0.55 * coarse + 0.2 * spots + 0.25 * sod + lanes + colours.cover
     )
     t = texels_around(p[0] * 0.011, p[1] * 0.011 + 0.37)
     outside = 1.0 - inside
     fields = 0.22 + 0.45 * smoothstep(0.35, 0.65, sampled(tables.noise, t, 1))
-    green = wp.where(outside > 0.0, wp.min(green + fields * outside, 0.92), green)
-    earth = mix(wp.vec3(0.11, 0.072, 0.042), wp.vec3(0.28, 0.195, 0.12), tone)
-    turf = mix(wp.vec3(0.035, 0.055, 0.014), wp.vec3(0.13, 0.15, 0.042), sod)
-    turf = mix(turf, wp.vec3(0.055, 0.085, 0.022), outside * smoothstep(0.35, 0.6, sampled(tables.noise, t, 2)))
+    green = wp.where(outside > 0.0, wp.min(green + fields * outside * colours.far_cover, 0.92), green)
+    earth = mix(colours.soil_dark, colours.soil_light, tone)
+    turf = mix(colours.turf_dark, colours.turf_light, sod)
+    turf = mix(turf, colours.field, outside * smoothstep(0.35, 0.6, sampled(tables.noise, t, 2)))
+    earth = mix(earth, colours.straw * (0.6 + 0.8 * tone), straw_cover(colours, sod, shade))
+    turf = mix(turf, colours.dry * (0.6 + 0.8 * sod), dry_cover(colours, sod, spots))
     albedo = mix(earth, turf, green) * (0.8 + 0.4 * shade)
     occlusion = 0.6 + 0.8 * wp.min(tone, 0.5)
     ndl = wp.dot(n, light.sun)

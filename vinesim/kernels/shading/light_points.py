@@ -264,7 +264,7 @@ def sun_row(depth: wp.array(dtype=wp.float32), at: int, z: float, a: float) -> f
 @wp.func
 def haze(light: Light, colour: wp.vec3, distance: float) -> wp.vec3:
     """Returns the radiance ``colour`` as it appears through ``distance`` [m] of hazy air."""
-    return mix(colour, light.haze_colour, 0.6 * (1.0 - falling_exp(distance * 0.006)))
+    return mix(colour, light.haze_colour, 0.6 * (1.0 - falling_exp(distance * light.haze_rate)))
 
 
 @wp.kernel

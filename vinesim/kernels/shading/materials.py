@@ -30,6 +30,52 @@ OLD_BARK = wp.constant(18)
 
 
 @wp.struct
+class Colours:
+    """Colours of plants and ground (linear RGB) that belong to no single primitive, and shares of the ground."""
+
+    soil_dark: wp.vec3
+    soil_light: wp.vec3
+    turf_dark: wp.vec3
+    turf_light: wp.vec3
+    field: wp.vec3
+    """Sod of the fields around the vineyard."""
+    dry: wp.vec3
+    """Dry grass."""
+    straw: wp.vec3
+    cover: float
+    """Added to the noise that decides where sod is."""
+    most_cover: float
+    """Largest share of sod at one place."""
+    far_cover: float
+    """Share of sod of the fields around the vineyard, relative to that of the default palette."""
+    strip: float
+    """Contrast between bare ground under the vines and sod between the rows."""
+    dry_share: float
+    dry_gain: float
+    """Share of the sod that is dry, and how much it varies with the noise."""
+    straw_share: float
+    straw_gain: float
+    """Share of the soil that straw covers, and how much it varies with the noise."""
+    soil_ratio: float
+    sod_ratio: float
+    """Ratios of green to red albedo of bare soil and of sod."""
+    margin: wp.vec3
+    """Yellow margins of leaves."""
+    scorch: wp.vec3
+    """Dead edges of leaves."""
+    through: wp.vec3
+    """Light through a leaf, relative to its albedo."""
+    under: wp.vec3
+    """Felt of the lower side of leaves."""
+    under_vein: wp.vec3
+    vein: wp.vec3
+    blotch: wp.vec3
+    """Dark blotches on canes."""
+    bark_dark: wp.vec3
+    bark_light: wp.vec3
+
+
+@wp.struct
 class Materials:
     """Material and tint of each primitive, and the textures that materials sample."""
 
@@ -48,6 +94,7 @@ class Materials:
     ground_cell: float
     """The share of visible sky [row, column] above the ground, position of its first entry and its spacing [m]."""
     ground: Ground
+    colours: Colours
 
 
 @wp.func
@@ -128,6 +175,7 @@ def ground_surface(materials: Materials, p: wp.vec3, pixel: float, slant: float)
 
     ``pixel`` and ``slant`` are the lengths that one pixel covers across and along the line of sight [m].
     """
+    colours = materials.colours
     # at grazing angles spots of the texture would become bands: far away only the texture's mean is used
     blur = 1.0 / (1.0 + slant * slant * 1.5)
     mean = wp.vec4(0.5, 0.5, 0.5, 0.5)
@@ -165,15 +213,22 @@ def ground_surface(materials: Materials, p: wp.vec3, pixel: float, slant: float)
     green = smoothstep(
         0.38,
         0.60,
-        0.55 * coarse[0] + 0.2 * coarse[2] + 0.25 * sod + row_greenness(materials.rows, p[1]) * inside * blur,
+        0.55 * coarse[0]
+        + 0.2 * coarse[2]
+        + 0.25 * sod
+        + row_greenness(materials.rows, p[1]) * inside * blur * colours.strip
+        + colours.cover,
     )
-    green = green * 0.85
-    earth = mix(wp.vec3(0.11, 0.072, 0.042), wp.vec3(0.28, 0.195, 0.12), tone)
-    turf = mix(wp.vec3(0.035, 0.055, 0.014), wp.vec3(0.13, 0.15, 0.042), sod)
+    green = green * colours.most_cover
+    earth = mix(colours.soil_dark, colours.soil_light, tone)
+    turf = mix(colours.turf_dark, colours.turf_light, sod)
     if inside < 1.0:
         fields = sample_bilinear(materials.noise_texture, p[0] * 0.011, p[1] * 0.011 + 0.37)
-        green = wp.min(green + (0.22 + 0.45 * smoothstep(0.35, 0.65, fields[1])) * (1.0 - inside), 0.92)
-        turf = mix(turf, wp.vec3(0.055, 0.085, 0.022), (1.0 - inside) * smoothstep(0.35, 0.6, fields[2]))
+        far = (0.22 + 0.45 * smoothstep(0.35, 0.65, fields[1])) * (1.0 - inside) * colours.far_cover
+        green = wp.min(green + far, 0.92)
+        turf = mix(turf, colours.field, (1.0 - inside) * smoothstep(0.35, 0.6, fields[2]))
+    earth = mix(earth, colours.straw * (0.6 + 0.8 * tone), straw_cover(colours, sod, coarse[1]))
+    turf = mix(turf, colours.dry * (0.6 + 0.8 * sod), dry_cover(colours, sod, coarse[2]))
     s.albedo = mix(earth, turf, green) * (0.8 + 0.4 * coarse[1])
     s.occlusion = 0.6 + 0.8 * wp.min(tone, 0.5)
     s.specular = 0.0
@@ -191,6 +246,18 @@ def row_greenness(rows: wp.vec2, y: float) -> float:
     away = wp.abs(lane - wp.floor(lane + 0.5)) * rows[1]
     track = wp.abs(away - 0.5 * rows[1] + 0.7)
     return 0.16 - 0.26 * smoothstep(0.65, 0.25, away) - 0.14 * smoothstep(0.22, 0.08, track)
+
+
+@wp.func
+def dry_cover(colours: Colours, sod: float, spots: float) -> float:
+    """Returns the share of dry grass in the sod, 0 to 1; ``sod``, ``spots``: fine and coarse noise around 0.5."""
+    return wp.clamp(colours.dry_share + colours.dry_gain * (0.4 * sod + 0.6 * spots - 0.5), 0.0, 1.0)
+
+
+@wp.func
+def straw_cover(colours: Colours, sod: float, spots: float) -> float:
+    """Returns the share of the soil that straw covers, 0 to 1; ``sod``, ``spots``: fine and coarse noise around 0.5."""
+    return wp.clamp(colours.straw_share + colours.straw_gain * (0.7 * sod + 0.3 * spots - 0.5), 0.0, 1.0)
 
 
 @wp.func
@@ -309,17 +376,17 @@ def leaf_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, d: wp.vec3
                 age * smoothstep(0.16 + 0.1 * age, 0.0, edge - 0.10 * spot[1])
                 + 0.7 * smoothstep(0.62, 0.9, age) * spot[0]
             )
-            s.albedo = mix(s.albedo, wp.vec3(0.40, 0.34, 0.05), wp.clamp(yellow, 0.0, 1.0))
+            s.albedo = mix(s.albedo, materials.colours.margin, wp.clamp(yellow, 0.0, 1.0))
             brown = smoothstep(0.03, 0.0, edge - 0.05 * spot[2] * age) * smoothstep(0.35, 0.6, age)
-            s.albedo = mix(s.albedo, wp.vec3(0.16, 0.085, 0.03), brown)
-        s.transmission = wp.cw_mul(s.albedo, wp.vec3(2.3, 2.0, 0.75)) * (1.0 - 0.7 * vein)
+            s.albedo = mix(s.albedo, materials.colours.scorch, brown)
+        s.transmission = wp.cw_mul(s.albedo, materials.colours.through) * (1.0 - 0.7 * vein)
         if wp.dot(plain, d) > 0.0:  # the lower side is paler, felted, with raised veins
-            s.albedo = mix(s.albedo * 1.05, wp.vec3(0.22, 0.27, 0.16), 0.42)
-            s.albedo = mix(s.albedo, wp.vec3(0.34, 0.38, 0.20), vein * 0.7)
+            s.albedo = mix(s.albedo * 1.05, materials.colours.under, 0.42)
+            s.albedo = mix(s.albedo, materials.colours.under_vein, vein * 0.7)
             s.specular = 0.012
             s.shininess = 6.0
         else:
-            s.albedo = mix(s.albedo, wp.vec3(0.20, 0.28, 0.08), vein * 0.40)
+            s.albedo = mix(s.albedo, materials.colours.vein, vein * 0.40)
             s.specular = 0.05
             s.shininess = 22.0
             s.reflectivity = 0.55

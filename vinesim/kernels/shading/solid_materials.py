@@ -147,7 +147,7 @@ def woody_surface(
             t = sample_bilinear(
                 materials.noise_texture, grain[0] * 9.0 + grain[1] * 7.0 + seed, grain[2] * 1.6 + seed * 3.1
             )
-            s.albedo = mix(tint * (0.55 + 0.9 * t[2]), wp.vec3(0.20, 0.10, 0.045), 0.5 * smoothstep(0.45, 0.7, t[0]))
+            s.albedo = mix(tint * (0.55 + 0.9 * t[2]), materials.colours.blotch, 0.5 * smoothstep(0.45, 0.7, t[0]))
             s.normal = wp.normalize(n + wp.vec3(t[1] - 0.5, t[2] - 0.5, t[3] - 0.5) * (0.7 / (1.0 + pixel * 500.0)))
         s.shininess = 14.0
     elif material == BARK:
@@ -160,7 +160,7 @@ def woody_surface(
             materials.noise_texture, grain[0] * 6.0 + grain[2] * 0.45, grain[1] * 6.0 + grain[2] * 0.32 + seed
         )
         height = wide[2] * 0.6 + fine[1] * 0.4
-        s.albedo = mix(wp.vec3(0.085, 0.063, 0.045), wp.vec3(0.23, 0.175, 0.125), smoothstep(0.25, 0.80, height))
+        s.albedo = mix(materials.colours.bark_dark, materials.colours.bark_light, smoothstep(0.25, 0.80, height))
         s.occlusion = 0.6 + 0.4 * smoothstep(0.3, 0.55, height)
         s.normal = wp.normalize(n + wp.vec3(wide[2] - 0.5, fine[1] - 0.5, (wide[3] - 0.5) * 0.3) * 1.0)
         s.specular = 0.01

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from vinesim.core import array_fields, disk_cache, frames, portable_math
-from vinesim.scene import berries, builder, leaves, plant_parameters
+from vinesim.scene import berries, builder, leaves, palette, plant_parameters
 from vinesim.scene.generation.fixed_structure import FixedStructure, build_fixed_structure
 from vinesim.scene.generation.old_wood import with_old_wood
 from vinesim.scene.generation.plant_bodies import Bodies, build_bodies, place_leaves
@@ -57,6 +57,7 @@ def generate(scene: Scene) -> Model:
     plants = msgspec.structs.replace(
         scene,
         name="",
+        palette=palette.PaletteTable(),
         sun=Sun(),
         wind=Wind(),
         datum=Datum(),
@@ -76,8 +77,11 @@ def generate(scene: Scene) -> Model:
     digest = disk_cache.source_digest(_code_digest(), msgspec.json.encode((plants, parameters, imported, ground)))
     clutter, seed = _clutter_of(scene)
     look = _fruit_look(scene)
+    colours = palette.resolve(scene)
     arrays = disk_cache.load_or_make("vineyard", digest, make)
-    return Model(terrain=terrain, clutter=clutter, clutter_seed=seed, fruit_look=look, **arrays).check()
+    return Model(
+        terrain=terrain, clutter=clutter, clutter_seed=seed, fruit_look=look, palette=colours, **arrays
+    ).check()
 
 
 def generate_uncached(scene: Scene) -> Model:
@@ -130,6 +134,7 @@ def _generate(scene: Scene, parameters: VineParameters, terrain: Terrain | None)
             model.box_pose[i] = terrain.resting_pose(box.x, box.y, box.yaw, half)
     model = builder.solve_rest_pose(model).check()
     model.fruit_look = _fruit_look(scene)
+    model.palette = palette.resolve(scene)
     variety = [v.name for v in berries.VARIETIES].index(scene.fruit.varieties[0])
     for number, one in enumerate(scene.imported):
         foot = one.z + float(ground_height(terrain, one.x, one.y))

@@ -102,6 +102,7 @@ def join_models(first: Model, second: Model) -> Model:
         clutter=first.clutter,
         clutter_seed=first.clutter_seed,
         fruit_look=first.fruit_look,
+        palette=first.palette,
         **joined,
     ).check()
 

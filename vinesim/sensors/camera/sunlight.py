@@ -16,6 +16,7 @@ import warp as wp
 
 from vinesim.core.thread_pool import ThreadPool
 from vinesim.kernels.shading import deferred, shadow_maps
+from vinesim.scene.palette import DEFAULT, Palette
 from vinesim.sensors.primitives import textures
 from vinesim.sensors.primitives.scene_primitives import Primitives
 
@@ -208,10 +209,7 @@ full light has radiance 1."""
 _NOON_SINE = 0.75
 _OPTICAL_DEPTH = np.array([0.10, 0.15, 0.27])
 """Optical depth of clear country air at 610, 550 and 465 nm (red, green, blue): Rayleigh scattering and some haze."""
-_SKY_COLOUR = np.array([0.52, 0.70, 1.0])
-_HAZE_COLOUR = np.array([0.50, 0.60, 0.72])
-_GROUND_COLOUR = np.array([0.26, 0.21, 0.13])
-_CANOPY_COLOUR = np.array([0.14, 0.19, 0.075])
+_CLEAR_SKY = np.array(DEFAULT.sky.light)
 _WHITE_BALANCE_SHARE = 0.6
 """Share of the daylight's colour cast that a camera's white balance removes, 0 to 1."""
 
@@ -257,18 +255,21 @@ class OutdoorLight:
     """White balance of a camera in this light: factors [3] on linear RGB."""
 
     @classmethod
-    def of(cls, height: float) -> OutdoorLight:
-        """Returns the daylight for ``height``, the sine of the sun's elevation."""
+    def of(cls, height: float, palette: Palette = DEFAULT) -> OutdoorLight:
+        """Returns the daylight for ``height``, the sine of the sun's elevation, in a vineyard with the colours of
+        ``palette``."""
         sun, dim = daylight(height)
-        falls = sun * max(height, 0.05) + _SKY_COLOUR * dim
-        usual = _NOON_SUN * _NOON_SINE + _SKY_COLOUR
+        sun = sun * palette.sky.sun
+        sky = np.array(palette.sky.light) * dim
+        falls = sun * max(height, 0.05) + sky
+        usual = _NOON_SUN * _NOON_SINE + _CLEAR_SKY
         brightness = float(falls.mean() / usual.mean())
         return cls(
             sun,
-            _SKY_COLOUR * dim,
-            _HAZE_COLOUR * dim,
-            _GROUND_COLOUR * brightness,
-            _CANOPY_COLOUR * brightness,
+            sky,
+            np.array(palette.sky.haze) * dim,
+            np.array(palette.ground.bounce) * brightness,
+            np.array(palette.leaf.shade) * brightness,
             dim,
             brightness,
             (usual / usual.mean() / (falls / falls.mean())) ** _WHITE_BALANCE_SHARE,
@@ -297,6 +298,7 @@ class Sunlight:
         self.period = period
         self._device = device
         self._direction = np.zeros(3)
+        self._palette = DEFAULT
         self.balance = np.ones(3)
         """White balance: factors [3] on linear light."""
         self.brightness = 1.0
@@ -319,22 +321,25 @@ class Sunlight:
         self._near = ShadowSquare(0.007 / fine, side, 2.5, 0.8, True, near, device, workers)
         self._far = ShadowSquare(0.035, 1024, 12.0, 4.0, False, far, device, workers)
 
-    def _update_light(self, time: float) -> None:
-        """Compute the daylight again if the sun has moved by a quarter of a degree since the last time."""
+    def _update_light(self, time: float, palette: Palette) -> None:
+        """Compute the daylight again if the sun has moved by a quarter of a degree since the last time, or if the
+        palette is another one."""
         direction = np.asarray(self._path(time), float)
         direction = direction / np.linalg.norm(direction)
-        if direction @ self._direction > _MIN_COS_CHANGE:
+        if direction @ self._direction > _MIN_COS_CHANGE and palette is self._palette:
             return
         self._direction = direction
+        self._palette = palette
         light = self.light
-        now = OutdoorLight.of(direction[2])
+        now = OutdoorLight.of(direction[2], palette)
         light.sun = _vector(direction)
         light.sun_colour = _vector(now.sun)
         light.sky_colour = _vector(now.sky)
         light.haze_colour = _vector(now.haze)
+        light.haze_rate = palette.sky.haze_rate
         light.ground_colour = _vector(now.ground)
         light.canopy_colour = _vector(now.canopy)
-        table = textures.sky_texture(tuple(direction), tuple(now.sun)) * np.float32(now.dim)
+        table = textures.sky_texture(tuple(direction), tuple(now.sun), palette.sky) * np.float32(now.dim)
         light.sky_table = wp.array(table, dtype=wp.vec3, device=self._device)
         self.brightness = now.brightness
         self.balance = now.balance
@@ -348,7 +353,7 @@ class Sunlight:
     ) -> tuple[shadow_maps.ShadowMap, shadow_maps.ShadowMap]:
         """Compute light and shadows again where they are no longer valid at ``time`` [s], for a camera at ``eye`` [3] m
         that looks along ``forward`` [3]. Returns the fine and the coarse shadow map."""
-        self._update_light(time)
+        self._update_light(time, primitives.model.palette)
         for one in (self._near, self._far):
             one.follow(primitives, eye, forward, time, self.period)
         return self._near.struct, self._far.struct

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from vinesim.core import frames
@@ -10,14 +11,20 @@ from vinesim.scene import leaves
 from vinesim.scene.berries import VARIETIES
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
+from vinesim.scene.palette import DEFAULT, LeafColours
 from vinesim.sensors.primitives import textures
 from vinesim.sensors.primitives.primitive_batches import Batch, make_batch, stack_columns
 from vinesim.sensors.raster.primitive_arrays import CONE, LEAF
 
-_CANE_TINT = (0.30, 0.17, 0.08)
-STEM_TINT = (0.19, 0.22, 0.075)
-"""Colours [linear RGB reflectance] of brown canes (``_CANE_TINT``) and of green stems, peduncles and rachises: GUESSED
-by eye."""
+STEM_TINT = DEFAULT.wood.stem
+"""Colour [linear RGB reflectance] of the rachis and the stalks of berries."""
+_YOUNG = 0.15
+_YOUNGEST = 0.03
+"""Ages (:attr:`Model.leaf_age`) between which a leaf's colour changes from young to grown. GUESSED."""
+_TURNED = 0.62
+"""Age from which a leaf counts as one that the season has turned yellow."""
+_UNTURNED = 0.42
+"""Age from which leaves show yellow margins."""
 
 
 _MOST_BENT = np.array([0.5, 0.7, 0.7])
@@ -37,7 +44,8 @@ def cane_batch(model: Model) -> Batch:
     # shoots become brown from the base: they are green towards the tip, brown where the wood is thick
     green = np.clip(1.6 - model.body_radius[bodies].mean(1) / 0.0022, 0.0, 1.0) * (seed[tree] < 0.6)
     green = np.where(organ == int(Organ.PEDUNCLE), 1.0, green)[:, None]
-    tint = (1.0 - green) * np.array(_CANE_TINT) * (0.7 + 0.6 * seed[tree, None]) + green * np.array(STEM_TINT)
+    wood = model.palette.wood
+    tint = (1.0 - green) * np.array(wood.cane) * (0.7 + 0.6 * seed[tree, None]) + green * np.array(wood.stem)
     material = np.where(green[:, 0] > 0.5, int(materials.STEM), int(materials.CANE))
     length = model.body_length[bodies]
     zero = np.zeros(len(bodies))
@@ -55,6 +63,38 @@ def cane_batch(model: Model) -> Batch:
     )
 
 
+def _leaf_tints(colours: LeafColours, age: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Returns the reflectance [leaf, 3] of the upper sides of leaves of ``age`` [leaf], linear RGB."""
+    count = len(age)
+    youth = np.clip((_YOUNG - age[:, None]) / (_YOUNG - _YOUNGEST), 0.0, 1.0)
+    grown = np.array(colours.grown)
+    base = grown + youth * (np.array(colours.young) - grown)
+    tint = (
+        base * (0.75 + 0.6 * rng.uniform(size=(count, 1))) * (1.0 + colours.value_spread * rng.normal(size=(count, 1)))
+    )
+    tint = tint + np.array(colours.pale) * np.clip(0.7 * rng.normal(size=(count, 1)), 0.0, 2.0)
+    if colours.hue_spread > 0.0:
+        # a generator of its own: the shapes of leaves do not depend on the palette
+        turn = colours.hue_spread * np.random.default_rng(41).normal(size=count)
+        tint = _turn_hue(np.clip(tint, 0.0, 1.0), turn)
+    return tint
+
+
+def _turn_hue(linear: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Returns linear RGB [n, 3] whose hue in sRGB is turned by ``turn`` [n] deg."""
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
+    hsv = cv2.cvtColor(encoded[None].astype(np.float32), cv2.COLOR_RGB2HSV)[0]
+    hsv[:, 0] = (hsv[:, 0] + turn) % 360.0
+    turned = cv2.cvtColor(hsv[None], cv2.COLOR_HSV2RGB)[0].astype(float)
+    return np.where(turned <= 0.04045, turned / 12.92, ((turned + 0.055) / 1.055) ** 2.4)
+
+
+def shown_age(colours: LeafColours, age: np.ndarray) -> np.ndarray:
+    """Returns the age [leaf] up to which leaves of ``age`` [leaf] show margins: leaves that the season has not turned
+    yellow have fewer of them where the palette says so."""
+    return age - (1.0 - colours.margins) * np.maximum(age - _UNTURNED, 0.0) * (age < _TURNED)
+
+
 def leaf_batches(model: Model) -> list[Batch]:
     """Returns the primitives of leaf blades, their petioles, and the cane nodes from which they grow."""
     count = len(model.leaf_body)
@@ -68,9 +108,8 @@ def leaf_batches(model: Model) -> list[Batch]:
     base = model.leaf_base
     petiole_end = model.leaf_pose[:, :3]
     size = model.leaf_size * textures.leaf_scale(shape)
-    young = rng.uniform(size=(count, 1))
-    tint = np.array([0.042, 0.115, 0.016]) * (0.75 + 0.6 * young) * (1.0 + 0.10 * rng.normal(size=(count, 1)))
-    tint = tint + np.array([0.030, 0.035, 0.0]) * np.clip(0.7 * rng.normal(size=(count, 1)), 0.0, 2.0)
+    colours = model.palette.leaf
+    tint = _leaf_tints(colours, model.leaf_age, rng)
     bend = np.stack([rng.normal(-0.10, 0.16, count), rng.normal(-0.16, 0.14, count), rng.uniform(0.0, 0.45, count)], 1)
     bend = np.clip(
         bend * (1.0 + rng.exponential(0.35, (count, 1))), -_MOST_BENT, _MOST_BENT
@@ -83,7 +122,7 @@ def leaf_batches(model: Model) -> list[Batch]:
         stack_columns(petiole_end, size),
         b=stack_columns(rib, shape),
         c=stack_columns(up, rng.uniform(size=count)),
-        d=stack_columns(bend, model.leaf_age),
+        d=stack_columns(bend, shown_age(colours, model.leaf_age)),
         material=int(materials.FOLIAGE),
         tint=tint,
         organ=int(Organ.LEAF),
@@ -96,7 +135,7 @@ def leaf_batches(model: Model) -> list[Batch]:
         stack_columns(base, 0.0017),
         b=stack_columns(petiole_end, 0.0012),
         material=int(materials.STEM),
-        tint=(0.21, 0.13, 0.06),
+        tint=colours.petiole,
         organ=int(Organ.LEAF),
         label=names,
         carrier=body,
@@ -112,7 +151,7 @@ def leaf_batches(model: Model) -> list[Batch]:
         stack_columns(axis - 0.7 * reach, 1.25 * r),
         b=stack_columns(axis + 0.4 * reach, 1.45 * r),
         material=int(materials.CANE),
-        tint=(0.24, 0.15, 0.07),
+        tint=model.palette.wood.node,
         organ=int(Organ.CANE),
         label=label(Organ.CANE, 0) + tree,
         carrier=body,

@@ -28,6 +28,7 @@ from vinesim.sensors.primitives.bunch_primitives import Ripeness, bunch_batches,
 from vinesim.sensors.primitives.clutter import clutter_batches
 from vinesim.sensors.primitives.distant_rows import distant_batches, shaded_extent
 from vinesim.sensors.primitives.leaf_area_density import LeafDensity
+from vinesim.sensors.primitives.palette_colours import colour_struct
 from vinesim.sensors.primitives.plant_primitives import cane_batch, leaf_batches
 from vinesim.sensors.primitives.primitive_batches import Batch, placeholder_batch
 from vinesim.sensors.primitives.primitive_clusters import ClusterLayout, join_rigid, lay_out
@@ -72,9 +73,10 @@ _TEXTURES = (
     "ground_y",
     "ground_cell",
     "ground",
+    "colours",
 )
-"""Fields of ``Materials`` that do not depend on the primitives: textures, rows of vines, visible sky above the ground.
-"""
+"""Fields of ``Materials`` that do not depend on the primitives: textures, rows of vines, visible sky above the ground,
+colours."""
 
 
 class Primitives:
@@ -130,6 +132,7 @@ class Primitives:
         """The uneven ground; without nodes the ground is the plane z = 0."""
         self._textures.rows = wp.vec2(*row_layout(model))
         self._textures.ground = self.ground
+        self._textures.colours = colour_struct(model.palette)
         self._textures.leaf_texture, self._textures.noise_texture, self._textures.soil_texture = (
             wp.array(table, dtype=wp.vec4, device=device)
             for table in (textures.leaf_texture(), textures.noise_texture(), textures.soil_texture())
@@ -227,8 +230,9 @@ class Primitives:
         around = [*trellis_batches(model, static), wire_batch(model, self._wires, self._bodies, len(model.tree_first))]
         if grass > 0.0:
             age = float(model.leaf_age.mean()) if len(model.leaf_age) else 0.0
-            tufts = grass_batch(row_layout(model), low, high, grass, static, model.terrain)
-            around += [tufts, litter_batch(low, high, age, static, model.terrain)]
+            colours = model.palette.ground
+            tufts = grass_batch(row_layout(model), low, high, grass, static, model.terrain, colours)
+            around += [tufts, litter_batch(low, high, age, static, model.terrain, colours)]
         batches += [b for b in around if b is not None]
         return [b for b in batches if len(b)] or [placeholder_batch(static)]
 
@@ -513,9 +517,8 @@ def _digest(model: Model, grass: float, device: str) -> str:
     shading = package / "kernels" / "shading"
     code += [shading / "materials.py", shading / "shadow_maps.py"]
     where = device.partition(":")[0]
-    return disk_cache.source_digest(
-        *code, f"{model.digest()} {grass!r} {berries.VARIETIES!r} {model.fruit_look!r}", where
-    )
+    looks = f"{model.palette!r} {model.fruit_look!r}"
+    return disk_cache.source_digest(*code, f"{model.digest()} {grass!r} {berries.VARIETIES!r} {looks}", where)
 
 
 def rest_snapshot(model: Model, visuals: tuple[RigidVisual, ...] = (), visual_q: np.ndarray | None = None) -> Snapshot:

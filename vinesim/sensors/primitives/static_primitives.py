@@ -9,6 +9,7 @@ from vinesim.kernels.shading import materials
 from vinesim.scene import leaves
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
+from vinesim.scene.palette import DEFAULT, GroundColours
 from vinesim.scene.terrain import Terrain, ground_height
 from vinesim.sensors.primitives import textures
 from vinesim.sensors.primitives.clutter import redrawn_posts, with_old_bark
@@ -20,12 +21,8 @@ _CELL_SIZE = 2.5
 """Width [m] of the squares of ground by which primitives that never move are grouped in clusters."""
 _MAX_SEGMENT = 0.5
 """Largest length [m] of a primitive that never moves; longer pieces are cut."""
-_TRELLIS = {
-    Organ.POLE: (int(materials.POST), (0.36, 0.33, 0.29)),
-    Organ.WIRE: (int(materials.WIRE), (0.33, 0.34, 0.35)),
-    Organ.TRUNK: (int(materials.BARK), (0.20, 0.15, 0.10)),
-    Organ.ARM: (int(materials.BARK), (0.20, 0.14, 0.09)),
-}
+_BARK_TINTS = {Organ.TRUNK: (0.20, 0.15, 0.10), Organ.ARM: (0.20, 0.14, 0.09)}
+"""Mean colours of bark; kernels take bark's colours from the palette."""
 
 
 def _ground_cells(position: np.ndarray, first: int) -> np.ndarray:
@@ -77,7 +74,7 @@ def _cones(model: Model, piece: np.ndarray, begin: np.ndarray, stop: np.ndarray)
     thick, thin = (radius[:, 0] * (1.0 - share) + radius[:, 1] * share for share in (begin, stop))
     organ = model.fixed_organ[piece]
     index = model.fixed_index[piece]
-    table = {o: _TRELLIS[Organ(int(o))] for o in np.unique(organ)}
+    table = {o: _look(model, Organ(int(o))) for o in np.unique(organ)}
     material, tint = (np.array([table[o][k] for o in organ]) for k in (0, 1))
     material, tint = with_old_bark(model, material, tint)
     rng = np.random.default_rng(3)
@@ -106,6 +103,16 @@ def _before(model: Model) -> np.ndarray:
     return np.where(elastic, before - before[first][arm], 0.0)
 
 
+def _look(model: Model, organ: Organ) -> tuple[int, tuple[float, float, float]]:
+    """Returns material and colour (linear RGB) of a part of the trellis or of old wood."""
+    wood = model.palette.wood
+    if organ == Organ.POLE:
+        return int(materials.POST), wood.post
+    if organ == Organ.WIRE:
+        return int(materials.WIRE), wood.wire
+    return int(materials.BARK), _BARK_TINTS[organ]
+
+
 def row_layout(model: Model) -> tuple[float, float]:
     """Returns the y coordinate [m] of the first row of vines, and the spacing [m] of the rows along y."""
     y = np.unique(np.round(model.fixed_start[model.fixed_organ == int(Organ.TRUNK), 1], 1))
@@ -124,15 +131,21 @@ def _row_greenness(rows: tuple[float, float], y: np.ndarray) -> np.ndarray:
 
 
 def litter_batch(
-    low: np.ndarray, high: np.ndarray, age: float, static_carrier: int, terrain: Terrain | None = None
+    low: np.ndarray,
+    high: np.ndarray,
+    age: float,
+    static_carrier: int,
+    terrain: Terrain | None = None,
+    colours: GroundColours = DEFAULT.ground,
 ) -> Batch | None:
     """Returns the primitives of fallen leaves on the ground between the corners ``low`` and ``high`` [2] m.
 
-    Their number grows with ``age``, the mean of :attr:`Model.leaf_age`; None without fallen leaves.
+    Their number grows with ``age``, the mean of :attr:`Model.leaf_age`, and with ``colours.litter``; None without
+    fallen leaves.
     """
     low = low - 1.0
     high = high + 1.0
-    n = int(min((1.0 + 12.0 * age) * np.prod(high - low), 30_000))
+    n = int(min(colours.litter * (1.0 + 12.0 * age) * np.prod(high - low), 30_000))
     if n == 0:
         return None
     rng = np.random.default_rng(29)
@@ -145,7 +158,7 @@ def litter_batch(
     if terrain is not None:
         rib, up = _lying(terrain, position, rib, up)
     dry = rng.uniform(size=(n, 1))
-    tint = (1.0 - dry) * np.array([0.30, 0.24, 0.05]) + dry * np.array([0.17, 0.10, 0.045])
+    tint = (1.0 - dry) * np.array(colours.litter_pale) + dry * np.array(colours.litter_brown)
     bend = stack_columns(
         rng.normal(0.0, 0.25, n), rng.normal(0.0, 0.25, n), rng.uniform(-0.2, 0.4, n), rng.uniform(0.8, 1.0, n)
     )
@@ -171,6 +184,7 @@ def grass_batch(
     density: float,
     static_carrier: int,
     terrain: Terrain | None = None,
+    colours: GroundColours = DEFAULT.ground,
 ) -> Batch | None:
     """Returns the primitives of grass tufts and herbs, with the ground's label, on the green parts of the ground.
 
@@ -185,7 +199,8 @@ def grass_batch(
     position = low + (high - low) * rng.uniform(size=(count, 2))
     noise = textures.sample_noise(position[:, 0] * 0.21, position[:, 1] * 0.21)
     # the same greenness as in the ground's colour
-    green = noise[:, 0] * 0.55 + 0.2 * noise[:, 2] + 0.125 + _row_greenness(rows, position[:, 1])
+    green = noise[:, 0] * 0.55 + 0.2 * noise[:, 2] + 0.125 + colours.strip * _row_greenness(rows, position[:, 1])
+    green = green + colours.cover
     position = position[green > 0.40 + 0.24 * rng.uniform(size=count)]
     n = len(position)
     herb = rng.uniform(size=n) < 0.12
@@ -196,8 +211,10 @@ def grass_batch(
     rib = np.sin(lean)[:, None] * out + np.cos(lean)[:, None] * np.array([0.0, 0.0, 1.0])
     up = np.cos(lean)[:, None] * out - np.sin(lean)[:, None] * np.array([0.0, 0.0, 1.0])
     root = stack_columns(position, ground_height(terrain, *position.T)) + 0.74 * size[:, None] * rib
-    tint = np.array([0.075, 0.12, 0.022]) * rng.uniform(0.6, 1.35, (n, 1))
-    tint = tint + np.array([0.10, 0.07, 0.02]) * (rng.uniform(size=(n, 1)) < 0.3) * rng.uniform(size=(n, 1))
+    tint = np.array(colours.grass) * rng.uniform(0.6, 1.35, (n, 1))
+    tint = tint + np.array(colours.weathered) * (rng.uniform(size=(n, 1)) < 0.3) * rng.uniform(size=(n, 1))
+    fate = np.random.default_rng(37).uniform(size=(2, n, 1))  # apart: the other tufts do not depend on the palette
+    tint = np.where(fate[0] < colours.dry_share, np.array(colours.dry) * (0.6 + 0.75 * fate[1]), tint)
     bend = stack_columns(rng.normal(0.0, 0.3, n), np.zeros(n), np.zeros(n), np.zeros(n))
     return make_batch(
         LEAF,

@@ -15,6 +15,7 @@ import numpy as np
 
 from vinesim.core import disk_cache
 from vinesim.scene import leaves
+from vinesim.scene.palette import DEFAULT, SkyColours
 
 GRASS_OUTLINE = leaves.SHAPE_COUNT
 HERB_OUTLINE = leaves.SHAPE_COUNT + 1
@@ -264,13 +265,13 @@ def _sky_layers() -> disk_cache.Arrays:
     """Compute the parts of the sky's texture that do not depend on the sun, as float64.
 
     Array ``cloud`` is the share of clouds, ``ridges`` and ``tree_share`` are the shares of hills and of trees in front
-    of the sky, in the lowest :data:`_RIDGE_ROWS` rows, and ``trees`` is the colour of the trees.
+    of the sky, in the lowest :data:`_RIDGE_ROWS` rows, and ``leafy`` is the tone of the trees, 0 to 1.
     """
     height, azimuth = (np.ascontiguousarray(part) for part in np.broadcast_arrays(*_sky_directions()))
     flat = np.sqrt(1.0 - height**2)
     far = 0.22 / (height + 0.12)
     cover = sample_noise(flat * np.cos(azimuth) * far * 0.5, flat * np.sin(azimuth) * far * 0.5, slice(0, 2))
-    cloud = smoothstep(0.56, 0.86, cover[..., 0] + 0.25 * (cover[..., 1] - 0.5)) * smoothstep(0.02, 0.2, height) * 0.55
+    cloud = smoothstep(0.56, 0.86, cover[..., 0] + 0.25 * (cover[..., 1] - 0.5)) * smoothstep(0.02, 0.2, height)
     height = height[:_RIDGE_ROWS]
     azimuth = azimuth[:_RIDGE_ROWS]
     turns = azimuth / (2.0 * np.pi)
@@ -282,19 +283,16 @@ def _sky_layers() -> disk_cache.Arrays:
         shares.append(smoothstep(0.004, -0.004, height - ridge))
     crowns = 0.014 + 0.020 * sample_noise(turns * 16.0, np.full_like(turns, 0.71), slice(1, 2))[..., 0]
     leafy = sample_noise(turns * 20.0, height * 8.0, slice(2, 3))
-    trees = np.array([0.095, 0.14, 0.085]) + (leafy - 0.5) * np.array([0.10, 0.14, 0.05])
     return {
         "cloud": cloud,
         "ridges": np.stack(shares),
-        "trees": trees,
+        "leafy": leafy,
         "tree_share": smoothstep(0.004, -0.004, height - crowns),
     }
 
 
 _RIDGE_ROWS = 180
 """Number of rows of the sky's texture that ridges and trees can cover, up to a sine of elevation of 0.12."""
-_RIDGE_TONES = np.array([0.36, 0.47, 0.62]), np.array([0.22, 0.32, 0.36])
-"""Colours (linear RGB) of the far and the near ridge of hills."""
 _SKY_BAND = 12
 """Number of rows of the sky's texture that are computed at once, which fit into a core's cache; a divisor of
 :data:`_RIDGE_ROWS`."""
@@ -305,46 +303,56 @@ def _sky_directions() -> tuple[np.ndarray, np.ndarray]:
     return np.linspace(0.0, 1.0, SKY_ROWS)[:, None] ** 2, np.linspace(-np.pi, np.pi, SKY_COLUMNS)[None]
 
 
-def _clear_sky() -> np.ndarray:
-    """Returns the colour [row, 1, 3] (linear RGB) of a sky without clouds, which does not depend on azimuth."""
+def _clear_sky(sky: SkyColours) -> np.ndarray:
+    """Returns the colour [row, 1, 3] (linear RGB) of a sky without thin clouds, which does not depend on azimuth.
+
+    A closed layer of clouds has the CIE's standard of an overcast sky: three times as bright above as at the horizon.
+    """
     height, _ = _sky_directions()
     horizon = np.exp(-5.5 * height)[..., None]
-    return (1.0 - horizon) * np.array([0.13, 0.30, 0.78]) + horizon * np.array([0.52, 0.68, 0.92])
+    clear = (1.0 - horizon) * np.array(sky.zenith) + horizon * np.array(sky.horizon)
+    closed = np.array(sky.light) * (0.45 + 0.9 * height[..., None])
+    return clear * (1.0 - sky.overcast) + closed * sky.overcast
 
 
 @functools.lru_cache(maxsize=1)  # cameras of one robot see the same sun
-def sky_texture(sun: tuple[float, float, float], colour_of_sun: tuple[float, float, float]) -> np.ndarray:
+def sky_texture(
+    sun: tuple[float, float, float], colour_of_sun: tuple[float, float, float], sky: SkyColours = DEFAULT.sky
+) -> np.ndarray:
     """Returns the radiance of the sky [SKY_ROWS, SKY_COLUMNS, 3] float32, by square root of the sine of elevation and
     by azimuth.
 
     The sky is blue with thin clouds, a halo around the sun that is redder for a low sun, and hills in the haze.
-    ``sun``: unit vector towards the sun; ``colour_of_sun``: linear RGB.
+    ``sun``: unit vector towards the sun; ``colour_of_sun``: linear RGB; ``sky``: its colours.
     """
     table = np.empty((SKY_ROWS, SKY_COLUMNS, 3), np.float32)
     layers = _sky_layers()
     for first in range(0, SKY_ROWS, _SKY_BAND):
         rows = slice(first, first + _SKY_BAND)
-        table[rows] = _sky_rows(rows, layers, np.array(sun), np.array(colour_of_sun))
+        table[rows] = _sky_rows(rows, layers, np.array(sun), np.array(colour_of_sun), sky)
     return table
 
 
-def _sky_rows(rows: slice, layers: disk_cache.Arrays, sun: np.ndarray, colour_of_sun: np.ndarray) -> np.ndarray:
+def _sky_rows(
+    rows: slice, layers: disk_cache.Arrays, sun: np.ndarray, colour_of_sun: np.ndarray, sky: SkyColours
+) -> np.ndarray:
     """Returns some ``rows`` of the sky's texture [row, SKY_COLUMNS, 3], which are all below or all above
     :data:`_RIDGE_ROWS`."""
     height, azimuth = _sky_directions()
     height = height[rows]
-    colour = _clear_sky()[rows]
+    colour = _clear_sky(sky)[rows]
     flat = np.sqrt(1.0 - height**2)
     x = flat * np.cos(azimuth)
     y = flat * np.sin(azimuth)
     away = 1.0 - np.clip(x * sun[0] + y * sun[1] + height * sun[2], 0.0, 1.0)
     halo = 0.07 * np.exp(-6.0 * away) + 0.35 * np.exp(-60.0 * away) + 6.0 * np.exp(-4000.0 * away)
     colour = colour + halo[..., None] * colour_of_sun
-    colour = _mix(colour, np.array([1.35, 1.33, 1.30]), layers["cloud"][rows])
+    colour = _mix(colour, np.array(sky.cloud), layers["cloud"][rows] * (sky.clouds * (1.0 - sky.overcast)))
     if rows.start < _RIDGE_ROWS:
-        for tone, share in zip(_RIDGE_TONES, layers["ridges"], strict=True):
-            colour = _mix(colour, tone, share[rows])
-        colour = _mix(colour, layers["trees"][rows], layers["tree_share"][rows])
+        for tone, share in zip((sky.far_hills, sky.hills), layers["ridges"], strict=True):
+            colour = _mix(colour, np.array(tone), share[rows])
+        trees = np.array(sky.trees) + (layers["leafy"][rows] - 0.5) * np.array(sky.trees_spread)
+        colour = _mix(colour, trees, layers["tree_share"][rows])
     return colour
 
 

@@ -10,6 +10,7 @@ uniform vec3 skyColour;
 uniform vec3 hazeColour;
 uniform vec3 groundColour;
 uniform vec3 canopyColour;
+uniform float paletteHazeRate; // [1/m]
 uniform vec3 gain;            // exposure and white balance
 uniform sampler2D noises;     // four octaves around 0.5, period 1
 uniform sampler2DArray outlines;
@@ -100,7 +101,7 @@ vec3 leaving(Surface s, vec3 plain, vec3 place, bool isLeaf, bool isBerry) {
     colour += s.transmission * (sunColour * max(-facing, 0.0) * lit * 0.55 + ambient(-n, s.sky) * 0.30 * s.occlusion);
   if (s.specular > 0.0) colour += glossed(s, isLeaf, d, n, facing, lit);
   colour += s.albedo * s.emission;
-  return mix(colour, hazeColour, 0.6 * (1.0 - exp(-length(place - eye) * 0.006)));
+  return mix(colour, hazeColour, 0.6 * (1.0 - exp(-length(place - eye) * paletteHazeRate)));
 }
 
 // Tone mapping: the filmic curve of Narkowicz (2015), then sRGB. PLAIN: sRGB by square roots, within 1/255.
@@ -160,15 +161,20 @@ Surface berry(vec3 n, vec3 tint, float sky, vec3 local, vec4 neighbours) {
 `;
 
 const FOLIAGE = /* glsl */ `
-const vec3 THROUGH = vec3(2.3, 2.0, 0.75); // light through a leaf, relative to its albedo
+uniform vec3 paletteThrough;   // light through a leaf, relative to its albedo
+uniform vec3 paletteUnder;     // felt of the lower side
+uniform vec3 paletteUnderVein;
+uniform vec3 paletteVein;
+uniform vec3 paletteMargin;    // yellow edge
+uniform vec3 paletteScorch;    // dead edge
 
 // The upper side or the lower one: paler, felted, its veins stand out. Returns the colour of veins and its share.
 vec4 sided(inout Surface s, bool isBelow) {
-  s.albedo = isBelow ? mix(s.albedo * 1.05, vec3(0.22, 0.27, 0.16), 0.42) : s.albedo;
+  s.albedo = isBelow ? mix(s.albedo * 1.05, paletteUnder, 0.42) : s.albedo;
   s.specular = isBelow ? 0.012 : 0.05;
   s.shininess = isBelow ? 6.0 : 22.0;
   s.reflectivity = isBelow ? 0.0 : 0.55;
-  return isBelow ? vec4(0.34, 0.38, 0.20, 0.7) : vec4(0.20, 0.28, 0.08, 0.40);
+  return isBelow ? vec4(paletteUnderVein, 0.7) : vec4(paletteVein, 0.40);
 }
 
 vec3 autumn(vec3 albedo, vec2 uv, float edge, float seed, float old) {
@@ -176,7 +182,7 @@ vec3 autumn(vec3 albedo, vec2 uv, float edge, float seed, float old) {
   vec4 spot = noiseAt(uv * 0.13 + seed * vec2(5.3, 2.7));
   float yellow = age * (1.0 - smoothstep(0.0, 0.16 + 0.1 * age, edge - 0.10 * spot.y)) + 0.7 * smoothstep(0.62, 0.9, age) * spot.x;
   float brown = (1.0 - smoothstep(0.0, 0.03, edge - 0.05 * spot.z * age)) * smoothstep(0.35, 0.6, age);
-  return mix(mix(albedo, vec3(0.40, 0.34, 0.05), step(0.02, age) * clamp(yellow, 0.0, 1.0)), vec3(0.16, 0.085, 0.03), brown);
+  return mix(mix(albedo, paletteMargin, step(0.02, age) * clamp(yellow, 0.0, 1.0)), paletteScorch, brown);
 }
 
 void grass(inout Surface s, vec3 plain, float height) {
@@ -223,7 +229,7 @@ Surface blade(vec3 plain, vec3 tint, float sky, vec3 local, float seed, vec4 det
   s.albedo *= mix(1.0, 0.72 + 0.5 * table.w, isNear);
   float edge = (255.0 * texture(outlines, vec3(uv, local.z)).x - 128.0) * 0.0025;
   s.albedo = autumn(s.albedo, local.xy, edge, seed, detail.w);
-  s.transmission = s.albedo * THROUGH * (1.0 - 0.7 * vein);
+  s.transmission = s.albedo * paletteThrough * (1.0 - 0.7 * vein);
   vec4 veins = sided(s, dot(plain, d) > 0.0);
   s.albedo = mix(s.albedo, veins.xyz, veins.w * vein);
   return s;
@@ -251,14 +257,14 @@ void lightLeaf(vec3 plain, float seed) {
   if (vSurface.y == GRASS) grass(s, plain, vLocal.y);
   else {
     s.albedo = autumn(s.albedo, vLocal.xy, 0.06, seed, vDetail.w);
-    s.transmission = s.albedo * THROUGH;
+    s.transmission = s.albedo * paletteThrough;
     veins = sided(s, isBelow);
   }
   vec3 n = isBelow ? -s.normal : s.normal;
   float facing = dot(n, sun), lit = sunShare(vPlace, dot(plain, sun) < 0.0 ? -plain : plain, s.sky);
   vec3 direct = max(facing, 0.0) * sunColour * lit * (0.35 + 0.65 * s.occlusion) + ambient(n, s.sky) * s.occlusion;
   vec3 through = s.transmission * (sunColour * max(-facing, 0.0) * lit * 0.55 + ambient(-n, s.sky) * 0.30 * s.occlusion);
-  float haze = 0.6 * (1.0 - exp(-length(vPlace - eye) * 0.006));
+  float haze = 0.6 * (1.0 - exp(-length(vPlace - eye) * paletteHazeRate));
   vColour = (s.albedo * direct + through) * (1.0 - haze);
   vVein = ((veins.xyz - s.albedo) * veins.w * direct - 0.7 * through) * (1.0 - haze);
   vGloss = mix(glossed(s, true, d, n, facing, lit), hazeColour, haze);
@@ -268,6 +274,9 @@ void lightLeaf(vec3 plain, float seed) {
 
 /** Wood and manufactured objects: grain is the position across (x, y) and along (z) the grain [m]. */
 export const SOLIDS = /* glsl */ `
+uniform vec3 paletteBarkDark;
+uniform vec3 paletteBarkLight;
+uniform vec3 paletteBlotch;    // dark blotches on canes
 #ifdef PLAIN
 // Wood and manufactured objects with one noise for all materials.
 void grained(inout Surface s, uint material, vec3 grain, float seed, float height) {
@@ -277,11 +286,11 @@ void grained(inout Surface s, uint material, vec3 grain, float seed, float heigh
   vec3 scale = isCane ? vec3(9.0, 7.0, 1.6) : isBark ? vec3(4.0, 4.0, 0.4) : vec3(1.7, 1.3, 0.5);
   vec4 t = noiseAt(vec2(grain.x * scale.x + grain.y * scale.y + seed, grain.z * scale.z + seed * 3.1));
   float rough = isWood ? 0.5 : material == CLOTH ? 0.6 : 0.0;
-  vec3 bark = mix(vec3(0.085, 0.063, 0.045), vec3(0.23, 0.175, 0.125), smoothstep(0.25, 0.80, t.z));
+  vec3 bark = mix(paletteBarkDark, paletteBarkLight, smoothstep(0.25, 0.80, t.z));
   float dirt = isPost ? 1.0 - 0.45 * (1.0 - smoothstep(0.0, 0.35, height)) * t.x : 1.0;
   float tone = isWood ? 0.55 + 0.9 * t.z : material == CLOTH ? 0.78 + 0.45 * t.x : material == METAL ? 0.55 : 0.85 + 0.3 * t.y * float(isGlossy);
   s.albedo = isBark ? bark : s.albedo * tone * dirt;
-  s.albedo = mix(s.albedo, vec3(0.20, 0.10, 0.045), isCane ? 0.5 * smoothstep(0.45, 0.7, t.x) : 0.0);
+  s.albedo = mix(s.albedo, paletteBlotch, isCane ? 0.5 * smoothstep(0.45, 0.7, t.x) : 0.0);
   s.normal = normalize(s.normal + (t.yzw - 0.5) * rough);
   s.wrap = material == SKIN ? vec3(0.35, 0.15, 0.10) : vec3(material == CLOTH ? 0.15 : 0.0);
   s.specular = isShiny ? 0.4 : isGlossy ? 0.05 : isWood || material == CLOTH ? 0.015 : s.specular;
@@ -294,14 +303,14 @@ void grained(inout Surface s, uint material, vec3 grain, float seed, float heigh
 void wood(inout Surface s, uint material, vec3 grain, float seed, float height) {
   if (material == CANE) {
     vec4 t = noiseAt(vec2(grain.x * 9.0 + grain.y * 7.0 + seed, grain.z * 1.6 + seed * 3.1));
-    s.albedo = mix(s.albedo * (0.55 + 0.9 * t.z), vec3(0.20, 0.10, 0.045), 0.5 * smoothstep(0.45, 0.7, t.x));
+    s.albedo = mix(s.albedo * (0.55 + 0.9 * t.z), paletteBlotch, 0.5 * smoothstep(0.45, 0.7, t.x));
     s.normal = normalize(s.normal + (t.yzw - 0.5) * 0.4);
     s.shininess = 14.0;
   } else if (material == BARK) {
     vec4 wide = noiseAt(vec2(grain.x * 2.6 + grain.z * 0.24 + seed, grain.y * 2.6 - grain.z * 0.10 + grain.x * 0.4));
     vec4 fine = noiseAt(vec2(grain.x * 6.0 + grain.z * 0.45, grain.y * 6.0 + grain.z * 0.32 + seed));
     float relief = wide.z * 0.6 + fine.y * 0.4;
-    s.albedo = mix(vec3(0.085, 0.063, 0.045), vec3(0.23, 0.175, 0.125), smoothstep(0.25, 0.80, relief));
+    s.albedo = mix(paletteBarkDark, paletteBarkLight, smoothstep(0.25, 0.80, relief));
     s.occlusion = 0.6 + 0.4 * smoothstep(0.3, 0.55, relief);
     s.normal = normalize(s.normal + vec3(wide.z - 0.5, fine.y - 0.5, (wide.w - 0.5) * 0.3));
     s.specular = 0.01;
@@ -358,6 +367,21 @@ export const GROUND = /* glsl */ `
 uniform sampler2D groundSky;
 uniform vec3 ground;   // lowest x and y, side of a cell
 uniform vec2 rows;     // y of the first row of vines, distance of rows
+uniform vec3 paletteSoilDark;
+uniform vec3 paletteSoilLight;
+uniform vec3 paletteTurfDark;
+uniform vec3 paletteTurfLight;
+uniform vec3 paletteField;
+uniform vec3 paletteDry;
+uniform vec3 paletteStraw;
+uniform float paletteCover;
+uniform float paletteMostCover;
+uniform float paletteFarCover;
+uniform float paletteStrip;
+uniform float paletteDryShare;
+uniform float paletteDryGain;
+uniform float paletteStrawShare;
+uniform float paletteStrawGain;
 
 Surface soil(vec2 p, vec2 rise) {
   vec2 size = vec2(textureSize(groundSky, 0)), cell = (p - ground.xy) / ground.z, last = size - 1.0;
@@ -374,11 +398,16 @@ Surface soil(vec2 p, vec2 rise) {
   float tone = 0.54 + 0.6 * (near.z - 0.5) + 0.4 * (near.w - 0.5), sod = 0.5 + 0.9 * (near.w - 0.5) + 0.5 * (near.z - 0.5);
   float lane = (p.y - rows.x) / rows.y, away = abs(lane - round(lane)) * rows.y, track = abs(away - 0.5 * rows.y + 0.7);
   float greenness = 0.16 - 0.26 * (1.0 - smoothstep(0.25, 0.65, away)) - 0.14 * (1.0 - smoothstep(0.08, 0.22, track));
-  float green = 0.85 * smoothstep(0.38, 0.60, 0.55 * coarse.x + 0.2 * coarse.z + 0.25 * sod + greenness * inside);
-  green = min(green + (0.22 + 0.45 * smoothstep(0.35, 0.65, fields.y)) * outside, outside > 0.0 ? 0.92 : 1.0);
-  vec3 earth = mix(vec3(0.11, 0.072, 0.042), vec3(0.28, 0.195, 0.12), clamp(tone, 0.0, 1.0));
-  vec3 turf = mix(vec3(0.035, 0.055, 0.014), vec3(0.13, 0.15, 0.042), clamp(sod, 0.0, 1.0));
-  turf = mix(turf, vec3(0.055, 0.085, 0.022), outside * smoothstep(0.35, 0.6, fields.z));
+  float cover = 0.55 * coarse.x + 0.2 * coarse.z + 0.25 * sod + greenness * inside * paletteStrip + paletteCover;
+  float green = paletteMostCover * smoothstep(0.38, 0.60, cover);
+  green = min(green + (0.22 + 0.45 * smoothstep(0.35, 0.65, fields.y)) * outside * paletteFarCover, outside > 0.0 ? 0.92 : 1.0);
+  vec3 earth = mix(paletteSoilDark, paletteSoilLight, clamp(tone, 0.0, 1.0));
+  vec3 turf = mix(paletteTurfDark, paletteTurfLight, clamp(sod, 0.0, 1.0));
+  turf = mix(turf, paletteField, outside * smoothstep(0.35, 0.6, fields.z));
+  float straw = paletteStrawShare + paletteStrawGain * (0.7 * sod + 0.3 * coarse.y - 0.5);
+  float dry = paletteDryShare + paletteDryGain * (0.4 * sod + 0.6 * coarse.z - 0.5);
+  earth = mix(earth, paletteStraw * (0.6 + 0.8 * tone), clamp(straw, 0.0, 1.0));
+  turf = mix(turf, paletteDry * (0.6 + 0.8 * sod), clamp(dry, 0.0, 1.0));
   vec2 slope = vec2(near.w - near.y, near.z - near.y) - rise;
   Surface s = diffuse(normalize(vec3(slope, 1.0)), mix(earth, turf, green) * (0.8 + 0.4 * coarse.y), sky);
   s.occlusion = 0.6 + 0.8 * min(tone, 0.5);
@@ -390,23 +419,34 @@ Surface soil(vec2 p, vec2 rise) {
 /** Sky: clear blue with thin clouds, a halo around the sun, hills in the haze, and trees in front of them. */
 export const SKY = /* glsl */ `
 uniform float skyDim;
+uniform vec3 paletteZenith;
+uniform vec3 paletteHorizon;
+uniform vec3 paletteCloud;
+uniform vec3 paletteLight;
+uniform vec3 paletteFarHills;
+uniform vec3 paletteHills;
+uniform vec3 paletteTrees;
+uniform vec3 paletteTreesSpread;
+uniform float paletteClouds;
+uniform float paletteOvercast;
 
 float layer(vec2 at, int octave) { return textureLod(noises, at + 0.5 / 256.0, 0.0)[octave]; }
 
 vec3 skyLight(vec3 d) {
   float height = max(d.z, 0.0), turns = atan(d.y, d.x) / 6.2831853, far = 0.5 * 0.22 / (height + 0.12);
-  vec3 colour = mix(vec3(0.13, 0.30, 0.78), vec3(0.52, 0.68, 0.92), exp(-5.5 * height));
+  vec3 colour = mix(paletteZenith, paletteHorizon, exp(-5.5 * height));
+  colour = mix(colour, paletteLight * (0.45 + 0.9 * height), paletteOvercast);
   float away = 1.0 - clamp(dot(d, sun), 0.0, 1.0);
   colour += (0.07 * exp(-6.0 * away) + 0.35 * exp(-60.0 * away) + 6.0 * exp(-4000.0 * away)) * sunColour;
   vec2 at = normalize(d.xy + 1e-9) * sqrt(1.0 - height * height) * far;
-  float cloud = smoothstep(0.56, 0.86, layer(at, 0) + 0.25 * (layer(at, 1) - 0.5)) * smoothstep(0.02, 0.2, height) * 0.55;
-  colour = mix(colour, vec3(1.35, 1.33, 1.30), cloud);
+  float cloud = smoothstep(0.56, 0.86, layer(at, 0) + 0.25 * (layer(at, 1) - 0.5)) * smoothstep(0.02, 0.2, height);
+  colour = mix(colour, paletteCloud, cloud * paletteClouds * (1.0 - paletteOvercast));
   float ridge = 0.045 + 0.085 * (layer(vec2(2.0 * turns, 0.26), 0) - 0.35);
   float nearer = 0.020 + 0.050 * (layer(vec2(3.0 * turns, 0.39), 0) - 0.35);
   float crowns = 0.014 + 0.020 * layer(vec2(16.0 * turns, 0.71), 1);
-  vec3 trees = vec3(0.095, 0.14, 0.085) + (layer(vec2(20.0 * turns, 8.0 * height), 2) - 0.5) * vec3(0.10, 0.14, 0.05);
-  colour = mix(colour, vec3(0.36, 0.47, 0.62), 1.0 - smoothstep(-0.004, 0.004, height - ridge));
-  colour = mix(colour, vec3(0.22, 0.32, 0.36), 1.0 - smoothstep(-0.004, 0.004, height - nearer));
+  vec3 trees = paletteTrees + (layer(vec2(20.0 * turns, 8.0 * height), 2) - 0.5) * paletteTreesSpread;
+  colour = mix(colour, paletteFarHills, 1.0 - smoothstep(-0.004, 0.004, height - ridge));
+  colour = mix(colour, paletteHills, 1.0 - smoothstep(-0.004, 0.004, height - nearer));
   colour = mix(colour, trees, 1.0 - smoothstep(-0.004, 0.004, height - crowns));
   return colour * skyDim;
 }

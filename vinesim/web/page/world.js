@@ -173,6 +173,7 @@ export class World {
       outlines: { value: outlines },
       noises: { value: noises },
       ...lightOf(header.light),
+      ...paletteOf(header.palette),
       sunDepth: { value: this.sunTarget.depthTexture },
       sunMatrix: { value: new THREE.Matrix4() },
       sunTexel: { value: (2 * SUN_REACH) / SUN_SIZE },
@@ -542,6 +543,16 @@ function lightOf({ balance, exposure, dim, ...colours }) {
   const uniforms = { gain: { value: new THREE.Vector3(...balance).multiplyScalar(exposure) }, skyDim: { value: dim } };
   for (const [name, colour] of Object.entries(colours))
     uniforms[`${name}Colour`] = { value: new THREE.Vector3(...colour) };
+  return uniforms;
+}
+
+/** Uniforms of the vineyard's colours (three numbers) and shares (one number): soil_dark becomes paletteSoilDark. */
+function paletteOf(palette) {
+  const uniforms = {};
+  for (const [name, value] of Object.entries(palette)) {
+    const words = name.split("_").map((word) => word[0].toUpperCase() + word.slice(1));
+    uniforms[`palette${words.join("")}`] = { value: Array.isArray(value) ? new THREE.Vector3(...value) : value };
+  }
   return uniforms;
 }
 
