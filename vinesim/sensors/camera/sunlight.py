@@ -285,16 +285,19 @@ class Sunlight:
         taps: int = 4,
         period: float = 0.2,
         fine: int = 1,
+        flash: float = 0.0,
         device: str = "cpu",
         workers: ThreadPool | None = None,
     ) -> None:
         """``sun``: vector towards the sun, or a function from simulated time [s] to that vector.
 
         ``taps``: ``shadow_taps`` of :class:`vinesim.kernels.shading.deferred.Light`; ``period``: least time [s] between
-        redraws of shadows; ``fine``: divisor of the texel size of the near shadow map.
+        redraws of shadows; ``fine``: divisor of the texel size of the near shadow map; ``flash``: ``flash`` of
+        :class:`vinesim.kernels.shading.deferred.Light` while the sun is below the horizon.
         """
         self._path: SunPath = sun if callable(sun) else lambda time: sun
         self.period = period
+        self._flash = flash
         self._device = device
         self._direction = np.zeros(3)
         self.balance = np.ones(3)
@@ -329,6 +332,7 @@ class Sunlight:
         light = self.light
         now = OutdoorLight.of(direction[2])
         light.sun = _vector(direction)
+        light.flash = self._flash if direction[2] < 0.0 else 0.0
         light.sun_colour = _vector(now.sun)
         light.sky_colour = _vector(now.sky)
         light.haze_colour = _vector(now.haze)
