@@ -99,7 +99,9 @@ def run(
     if hour is not None:
         plan = msgspec.structs.replace(plan, sun=msgspec.structs.replace(plan.sun, hour=hour))
     actors = {"robots": list(robots), "people": list(people), "crates": list(crates)}
-    work = _Work(out, viewpoints, path is not None, mounts, plan, camera, spec, info, time, device, actors, colour, moving)
+    work = _Work(
+        out, viewpoints, path is not None, mounts, plan, camera, spec, info, time, device, actors, colour, moving
+    )
     try:
         work.do(staged)
     except KeyboardInterrupt:

@@ -54,7 +54,9 @@ def average_samples(
     top = (pixel // width) * samples
     colour = wp.vec3(0.0, 0.0, 0.0)
     for k in range(samples * samples):
-        colour += wp.min(radiance[(top + k // samples) * width * samples + left + k % samples], wp.vec3(most, most, most))
+        colour += wp.min(
+            radiance[(top + k // samples) * width * samples + left + k % samples], wp.vec3(most, most, most)
+        )
     light_out[pixel] = colour / float(samples * samples)
 
 
@@ -109,7 +111,9 @@ def respond_rows(
             place = noise + x
             r = sensed(wp.max(light[pixel, 0], 0.0) * gain[0] * here, shot, read, response.noise[place])
             g = sensed(wp.max(light[pixel, 1], 0.0) * gain[1] * here, shot, read, response.noise[place + NOISE_STRIDE])
-            b = sensed(wp.max(light[pixel, 2], 0.0) * gain[2] * here, shot, read, response.noise[place + 2 * NOISE_STRIDE])
+            b = sensed(
+                wp.max(light[pixel, 2], 0.0) * gain[2] * here, shot, read, response.noise[place + 2 * NOISE_STRIDE]
+            )
             red[k] = tone_index(m[0, 0] * r + m[0, 1] * g + m[0, 2] * b)
             green[k] = tone_index(m[1, 0] * r + m[1, 1] * g + m[1, 2] * b)
             blue[k] = tone_index(m[2, 0] * r + m[2, 1] * g + m[2, 2] * b)

@@ -39,7 +39,6 @@ from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole, 
 from vinesim.sensors.raster.lens_map import LensError, LensMap, lens_map
 from vinesim.sensors.sensor import SensorMaker, SensorSetting
 
-
 COLOURS = ("camera", "exact")
 """Colours of a picture: ``camera``, those of the camera's data sheet; ``exact``, before the camera's response, as of a
 data sheet without ``[colour]``."""

@@ -1,8 +1,8 @@
 """Pictures of a moving camera or a moving scene: motion blur, and the rolling shutter.
 
 A picture is the mean of several pictures of short moments. Each row has its own exposure, which begins later than that
-of the row above it by the line delay. So a row is the mean of the moments that its exposure covers, each weighted by the
-covered share.
+of the row above it by the line delay. So a row is the mean of the moments that its exposure covers, each weighted by
+the covered share.
 """
 
 from __future__ import annotations

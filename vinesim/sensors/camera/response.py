@@ -1,8 +1,8 @@
 """How a model of camera turns light into 8-bit colours: the ``[colour]`` table of its data sheet.
 
-Light from the lens is blurred, exposed, weakened towards the corners, and clipped where a pixel is full. It has the shot
-noise of its electrons and the noise of the read-out. A colour matrix and a tone curve follow, then chroma subsampling
-and JPEG. Without this table a camera has the exact colours of :mod:`vinesim.sensors.camera.exposure`.
+Light from the lens is blurred, exposed, weakened towards the corners, and clipped where a pixel is full. It has the
+shot noise of its electrons and the noise of the read-out. A colour matrix and a tone curve follow, then chroma
+subsampling and JPEG. Without this table a camera has the exact colours of :mod:`vinesim.sensors.camera.exposure`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.core.thread_pool import ThreadPool
-from vinesim.kernels.shading import colour_response, deferred
+from vinesim.kernels.shading import colour_response
 from vinesim.kernels.shading.colour_response import NOISE_STRIDE, TONE_ENTRIES
 from vinesim.scene.plant_parameters import Number
 from vinesim.sensors import spec_file
@@ -52,7 +52,7 @@ class ColourSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     white: Annotated[Number, "1", (0.01, 100.0)]
     """Exposed radiance at which a pixel is full; all brighter light has the value 255."""
     shoulder: Annotated[Number, "1", (0.0, 100.0)]
-    """Compression of bright light: the slope of the tone curve is 1 + shoulder at black, 1 / (1 + shoulder) at white."""
+    """Compression of bright light: the tone curve has the slope 1 + shoulder at black, 1 / (1 + shoulder) at white."""
     toe: Annotated[Number, "1", (0.0, 1.0)]
     """Light, as a share of white, below which the tone curve bends towards black."""
     contrast: Annotated[Number, "1", (0.2, 5.0)]
@@ -60,7 +60,7 @@ class ColourSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     saturation: Annotated[Number, "1", (0.0, 4.0)]
     """Factor on the differences between a colour and its luminance, in linear light."""
     balance: Annotated[Number, "1", (0.0, 1.0)]
-    """Standard deviation of the error of the white balance: of the natural logarithms of the factors on red and blue."""
+    """Standard deviation of the error of the white balance: of the logarithms of the factors on red and blue."""
     vignetting: Annotated[Number, "1", (0.0, 0.95)]
     """Share of the light that is lost in the corners; the loss grows with the square of the distance from the
     middle."""
@@ -77,8 +77,8 @@ class ColourSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     exposure_time: Annotated[Number | None, "s", (0.0, 10.0)] = None
     """Time for which a row is exposed; None: 0. Only pictures of a moving camera or scene depend on it."""
     line_delay: Annotated[Number | None, "s", (0.0, 0.1)] = None
-    """Time between the exposures of two neighbouring rows of a picture of the camera's own size (rolling shutter); None:
-    a global shutter. The time to read a whole picture does not depend on its size."""
+    """Time between the exposures of two neighbouring rows of a picture of the camera's own size (rolling shutter);
+    None: a global shutter. The time to read a whole picture does not depend on its size."""
     flash: Annotated[Number | None, "m^2", (0.0, 1000.0)] = None
     """Strength of a flash at the lens, which fires when the sun is below the horizon: radiance of a white sheet that
     faces it, times the square of its distance. None: no flash."""
@@ -184,13 +184,11 @@ class Response:
             source = self._light
         return source.numpy().reshape(self.height, self.width, 3)
 
-    def develop(
-        self, light: np.ndarray, exposure: float, balance: np.ndarray, rng: np.random.Generator
-    ) -> np.ndarray:
+    def develop(self, light: np.ndarray, exposure: float, balance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Returns the 8-bit picture [height, width, 3] before compression.
 
-        ``light`` [height, width, 3]: linear RGB, which may be changed; ``balance``: white balance, factors [3]; ``rng``:
-        source of the noise of this picture.
+        ``light`` [height, width, 3]: linear RGB, which may be changed; ``balance``: white balance, factors [3];
+        ``rng``: source of the noise of this picture.
         """
         blur = self.spec.blur.value
         if blur > 0.0:

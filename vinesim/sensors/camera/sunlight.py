@@ -238,6 +238,11 @@ def daylight(height: float) -> tuple[np.ndarray, float]:
     return sun, 0.04 + 0.96 * float(np.clip((height + 0.1) / (_NOON_SINE + 0.1), 0.0, 1.0) ** 0.8)
 
 
+_TWILIGHT = 0.052
+"""Sine of the sun's depression, 3 degrees, over which the light of twilight falls to a tenth (civil twilight: 400 lx at
+sunset, 3.4 lx at its end, 6 degrees)."""
+
+
 @dataclasses.dataclass(frozen=True)
 class OutdoorLight:
     """Daylight for one elevation of the sun. Colours are linear RGB [3]."""
@@ -273,6 +278,13 @@ class OutdoorLight:
             brightness,
             (usual / usual.mean() / (falls / falls.mean())) ** _WHITE_BALANCE_SHARE,
         )
+
+    def dimmed(self, share: float) -> OutdoorLight:
+        """Returns this light without sun, with the ``share`` of all other light, for a camera with a flash: without one
+        a night is as bright as the end of the day, so that robots see something. The balance is that of white light,
+        as of the flash."""
+        other = (self.sky * share, self.haze * share, self.ground * share, self.canopy * share)
+        return OutdoorLight(np.zeros(3), *other, self.dim * share, self.brightness * share, np.ones(3))
 
 
 class Sunlight:
@@ -331,6 +343,8 @@ class Sunlight:
         self._direction = direction
         light = self.light
         now = OutdoorLight.of(direction[2])
+        if light.flash > 0.0:
+            now = now.dimmed(10.0 ** (direction[2] / _TWILIGHT))
         light.sun = _vector(direction)
         light.flash = self._flash if direction[2] < 0.0 else 0.0
         light.sun_colour = _vector(now.sun)
