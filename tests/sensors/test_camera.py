@@ -195,7 +195,7 @@ def test_bad_input_is_named(tmp_path) -> None:
         CameraSpec.load(str(file))
 
 
-@pytest.mark.parametrize("name", ["d435", "pinhole"])
+@pytest.mark.parametrize("name", ["d435", "phone", "pinhole", "raspberry_pi"])
 def test_shipped_cameras_load(name: str) -> None:
     info = CameraSpec.load(name).info("optical")
     assert (info.width, info.height) == (640, 480)

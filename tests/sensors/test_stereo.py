@@ -192,7 +192,9 @@ def test_truth_is_untouched() -> None:
     ideal = Camera(SPEC.ideal(), INFO).render(primitives, pose)
     assert np.array_equal(real.exact_depth, ideal.depth)
     assert np.array_equal(real.labels, ideal.labels)
-    assert np.array_equal(real.rgb, ideal.rgb)
+    exact = Camera(SPEC.coloured("exact"), INFO).render(primitives, pose)
+    assert np.array_equal(exact.rgb, ideal.rgb)
+    assert np.array_equal(exact.depth, real.depth, equal_nan=True)
     measured = np.isfinite(real.depth) & np.isfinite(ideal.depth)
     assert 0.5 < measured[ideal.depth < 4.0].mean() < 1.0
     error = np.abs(real.depth[measured] - ideal.depth[measured]) / ideal.depth[measured] ** 2

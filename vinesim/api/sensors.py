@@ -72,6 +72,7 @@ class Camera:
         *,
         size: tuple[int, int] | None = None,
         quality: str = "full",
+        colour: str = "camera",
         name: str = "camera",
         seed: int = 0,
     ) -> None:
@@ -82,12 +83,13 @@ class Camera:
             size: width and height [px] at the same angle of view; the camera's own size unless given.
             quality: ``"fast"``, ``"full"`` or ``"still"``: cost and quality of the picture. Exact depth and labels do
                 not depend on it.
+            colour: ``"camera"``: colours, noise and clipping as the camera file describes them; ``"exact"``: without.
             name: name of the camera. Name and ``seed`` together determine the noise of the measured depth.
             seed: see ``name``.
 
         Raises :class:`~vinesim.sensors.spec_file.SensorError` if the file cannot be used.
         """
-        self.spec = rgbd.CameraSpec.load(kind)
+        self.spec = rgbd.CameraSpec.load(kind).coloured(colour)
         self.info: CameraInfo = resized_intrinsics(self.spec, size)
         """Intrinsics of the camera."""
         self._name = name

@@ -67,6 +67,7 @@ def run(
     yolo: str = "detect",
     negatives: float = 0.0,
     semantic: bool = False,
+    colour: str = "camera",
 ) -> int:
     """Render the missing images, then gather the annotations of all images. Returns the exit code."""
     if seed < 0:
@@ -98,6 +99,7 @@ def run(
         parse_sensors(sensor or (), None if size is None else parse_size(size)),
         negatives,
         semantic,
+        colour,
     )
     running: list[Worker] = []
     try:

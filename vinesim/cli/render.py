@@ -66,6 +66,8 @@ def run(
     time: float = 0.0,
     device: str = "cpu",
     sensors: Sequence[str] = (),
+    colour: str = "camera",
+    velocity: str | None = None,
 ) -> int:
     """Render and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera``, ``truth`` JSON.
 
@@ -82,7 +84,13 @@ def run(
     from vinesim.sensors.export.dataset import resized_intrinsics
 
     pixels = None if size is None else parse_size(size)
-    spec = CameraSpec.load(camera)
+    spec = CameraSpec.load(camera).coloured(colour)
+    moving = None if velocity is None else parse_velocity(velocity)
+    if moving is not None and spec.colour is None:
+        raise UsageError(
+            f"--velocity {velocity} has no effect with exact colours; leave it out, or give a --camera whose file has "
+            "[colour], such as d435"
+        )
     info = resized_intrinsics(spec, pixels)
     mounts = parse_sensors(sensors, pixels)
     staged = parse_composition(robots, people, crates)
@@ -94,7 +102,9 @@ def run(
     if hour is not None:
         plan = msgspec.structs.replace(plan, sun=msgspec.structs.replace(plan.sun, hour=hour))
     actors = {"robots": list(robots), "people": list(people), "crates": list(crates)}
-    work = _Work(out, viewpoints, path is not None, mounts, plan, camera, spec, info, time, device, actors)
+    work = _Work(
+        out, viewpoints, path is not None, mounts, plan, camera, spec, info, time, device, actors, colour, moving
+    )
     try:
         work.do(staged)
     except KeyboardInterrupt:
@@ -128,6 +138,9 @@ class _Work:
     device: str
     actors: dict[str, list[str]]
     """Robots, people and crates as the user gave them."""
+    colour: str
+    velocity: tuple[float, ...] | None
+    """Velocity [m/s] and angular velocity [rad/s] of the camera, world axes; None: at rest."""
 
     def do(self, staged: SceneComposer) -> None:
         """Render and write the missing pictures. Raises OSError if they cannot be written."""
@@ -167,6 +180,7 @@ class _Work:
             self.info,
             self.time,
             self.sensors,
+            self.velocity,
         )
         done = self.done()
         if done:
@@ -214,6 +228,8 @@ class _Work:
             "vinesim": __version__,
             "seed": self.plan.seed,
             "camera": self.camera,
+            "colour": self.colour,
+            "velocity": self.velocity and list(self.velocity),
             "size": [self.info.width, self.info.height],
             "time": self.time,
             "device": self.device.partition(":")[0],  # all GPUs render equal pictures
@@ -259,6 +275,8 @@ class _Stage:
     """Simulated time, which determines the position of the sun [s]."""
     sensors: tuple[RenderedMount, ...]
     """Further sensors that measure from the camera's place."""
+    velocity: tuple[float, ...] | None
+    """Velocity [m/s] and angular velocity [rad/s] of the camera, world axes; None: at rest."""
 
     def render(self, viewpoint: Viewpoint) -> tuple[_Picture, str]:
         """Returns the picture from a viewpoint, and a text with the numbers of visible bunches, berries and cut
@@ -267,6 +285,7 @@ class _Stage:
         from vinesim.scene.wind import wind_of
         from vinesim.sensors import ground_truth
         from vinesim.sensors.camera.camera import Camera
+        from vinesim.sensors.camera.motion import Motion
         from vinesim.sensors.export import annotations as formats
         from vinesim.sensors.export import images as picture
         from vinesim.sensors.sensor import SensorSetting, export_frame
@@ -283,7 +302,8 @@ class _Stage:
             quality="still",
             device=self.primitives.device,
         )
-        frame = camera.render(self.primitives, pose)
+        motion = None if self.velocity is None else Motion(self.velocity[:3], self.velocity[3:])
+        frame = camera.render(self.primitives, pose, motion=motion)
         assert frame.exact_depth is not None, "a camera that renders by itself gives exact depth"
         images = {
             "rgb": frame.rgb,
@@ -348,6 +368,8 @@ def _viewpoints(at: str | None, look: str | None, path: pathlib.Path | None) -> 
     return [Viewpoint(parse_point("--at", at), parse_point("--look", look), f"--at {at}")]
 
 
+MAX_SPEED = 100.0
+"""Largest speed [m/s] and angular speed [rad/s] of a camera, in each axis."""
 _COLUMNS = ("x", "y", "z", "look_x", "look_y", "look_z")
 
 
@@ -486,6 +508,17 @@ def parse_sensors(texts: Sequence[str], size: tuple[int, int] | None) -> tuple[R
             raise UsageError(f"--sensor {text}: there are two of the name {mount.name!r}; rename one of the files")
         mounts[mount.name] = mount
     return tuple(mounts.values())
+
+
+def parse_velocity(text: str) -> tuple[float, ...]:
+    """Returns ``VX,VY,VZ[,WX,WY,WZ]`` as velocity [m/s] and angular velocity [rad/s]."""
+    with contextlib.suppress(ValueError):
+        numbers = [float(one) for one in text.split(",")]
+        if len(numbers) in (3, 6) and all(abs(one) <= MAX_SPEED for one in numbers):  # excludes NaN
+            return tuple(numbers + [0.0] * (6 - len(numbers)))
+    raise UsageError(
+        f"--velocity is {text!r}; give VX,VY,VZ in m/s, or with WX,WY,WZ in rad/s, each {MAX_SPEED:g} at most"
+    )
 
 
 def parse_size(text: str) -> tuple[int, int]:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vinesim.cli.commands.options import Camera, Device, ImageSize, Scene, Seed, Sensors
+from vinesim.cli.commands.options import Camera, Colour, Device, ImageSize, Scene, Seed, Sensors
 
 
 def scene_show(
@@ -126,6 +126,11 @@ def render(
         list[str] | None, typer.Option(help="X,Y[,YAW[,FILL]]: a crate, filled with bunches from 0 to 1.")
     ] = None,
     sensor: Sensors = None,
+    colour: Colour = "camera",
+    velocity: Annotated[
+        str | None,
+        typer.Option(help="VX,VY,VZ[,WX,WY,WZ]: motion of the camera [m/s, rad/s]; blurs and shears the picture."),
+    ] = None,
     device: Device = "cpu",
 ) -> None:
     """Render pictures with their ground truth: ids, masks, boxes, berries, cut points.
@@ -163,6 +168,8 @@ def render(
         people=person or (),
         crates=crate or (),
         sensors=sensor or (),
+        colour=colour,
+        velocity=velocity,
     )
     raise typer.Exit(code)
 
@@ -176,6 +183,7 @@ def dataset(
     seed: Annotated[int, typer.Option(help="The same seed gives the same images.")] = 0,
     camera: Camera = "d435",
     sensor: Sensors = None,
+    colour: Colour = "camera",
     size: ImageSize = None,
     workers: Annotated[
         int | None,

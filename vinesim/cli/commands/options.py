@@ -12,7 +12,10 @@ Scene = Annotated[
     str, typer.Option(help="A scene file, or the name of a shipped scene: demo, harvest, slope, tendone, vsp.")
 ]
 Device = Annotated[str, typer.Option(help="cpu, cuda or cuda:N (an NVIDIA GPU).")]
-Camera = Annotated[str, typer.Option(help="A camera file, or d435, pinhole.")]
+Camera = Annotated[str, typer.Option(help="A camera file, or d435, phone, pinhole, raspberry_pi.")]
+Colour = Annotated[
+    str, typer.Option(help="camera: colours, noise and clipping of the camera's file. exact: without them.")
+]
 ImageSize = Annotated[
     str | None, typer.Option(help="WxH [px] at the same horizontal field of view; by default the camera's own size.")
 ]

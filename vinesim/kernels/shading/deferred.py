@@ -50,6 +50,8 @@ class Light:
     haze_colour: wp.vec3
     haze_rate: float
     """Rate [1/m] at which surfaces fade into the haze with distance."""
+    flash: float
+    """Radiance of a white sheet that faces the camera at 1 m, lit by a flash at the lens; 0: no flash."""
     shadow_taps: int
     """Number of samples of the shadow map for each pixel; 0 means a smooth filter of two widths, -1 of one width."""
     sample_spiral: wp.array(dtype=wp.vec2)
@@ -216,6 +218,11 @@ def shade_surface(
     if s.specular > 0.0:
         colour += specular_light(materials, light, s, kind, d, n, ndl, lit)
     colour += s.albedo * s.emission
+    if light.flash > 0.0:
+        facing = wp.max(-wp.dot(n, d), 0.0)
+        gloss = s.specular * wp.exp(-s.shininess * (1.0 - facing)) * (s.shininess * 0.14 + 0.4)
+        falls = light.flash * facing / wp.max(t * t, 0.01)
+        colour += s.albedo * falls + wp.vec3(falls * gloss, falls * gloss, falls * gloss)
     return mix(colour, light.haze_colour, 0.6 * (1.0 - wp.exp(-t * light.haze_rate)))
 
 

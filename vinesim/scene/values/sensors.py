@@ -452,6 +452,8 @@ class CameraMount(PictureMount, frozen=True, forbid_unknown_fields=True):
 
     kind: ClassVar[str] = "camera"
     quality: Literal["fast", "full", "still"] = "fast"
+    colour: Literal["camera", "exact"] = "camera"
+    """``camera``: colours with the camera's response, if its data file has one; ``exact``: without."""
     field_of_view: float | None = None
     """Horizontal angle of view [rad]; by default that of the sensor's data file."""
     range: tuple[float, float] | None = None

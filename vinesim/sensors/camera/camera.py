@@ -20,7 +20,7 @@ from vinesim.core import frames
 from vinesim.core.thread_pool import MAX_THREADS, ThreadPool, usable_cores
 from vinesim.kernels.raster import camera_raster, camera_raster_plants
 from vinesim.kernels.raster.pinhole import Pinhole
-from vinesim.kernels.shading import deferred, light_plants, light_points, shadow_maps, tone_rows
+from vinesim.kernels.shading import colour_response, deferred, light_plants, light_points, shadow_maps, tone_rows
 from vinesim.kernels.shading.shadow_maps import ShadowMap
 from vinesim.kernels.stereo import stereo_rows
 from vinesim.scene.plant_parameters import Number
@@ -29,6 +29,8 @@ from vinesim.sensors import spec_file
 from vinesim.sensors.camera.exposure import Exposure
 from vinesim.sensors.camera.live_light import LiveLight
 from vinesim.sensors.camera.live_light import shadow_maps as shadow_maps_of
+from vinesim.sensors.camera.motion import Moments, Motion
+from vinesim.sensors.camera.response import ColourSpec, Response
 from vinesim.sensors.camera.stereo import Stereo, StereoSpec
 from vinesim.sensors.camera.sunlight import DEFAULT_SUN, Sunlight, SunPath
 from vinesim.sensors.ground_truth import visible_bunches
@@ -36,6 +38,10 @@ from vinesim.sensors.primitives.scene_primitives import Primitives
 from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole, supersampled
 from vinesim.sensors.raster.lens_map import LensError, LensMap, lens_map
 from vinesim.sensors.sensor import SensorMaker, SensorSetting
+
+COLOURS = ("camera", "exact")
+"""Colours of a picture: ``camera``, those of the camera's data sheet; ``exact``, before the camera's response, as of a
+data sheet without ``[colour]``."""
 
 
 class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -56,6 +62,8 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     distortion: Annotated[spec_file.Numbers | None, "1", (-1000.0, 1000.0)] = None
     """Coefficients of the lens distortion, in the order of sensor_msgs/CameraInfo: 5 (plumb_bob) or 8
     (rational_polynomial); None: a pinhole. Colour, depth and labels have equal distortion."""
+    colour: ColourSpec | None = None
+    """How light becomes 8-bit colours; None: exact colours, with neither noise nor clipping."""
 
     @classmethod
     def load(cls, name: str) -> CameraSpec:
@@ -70,12 +78,14 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
             lens_map(spec.info(""))
         except LensError as error:
             raise spec_file.SensorError(f"camera {name!r}: {error}") from error
+        if spec.colour is not None:
+            spec.colour.check(name)
         return spec
 
     def mounted(self, mount: CameraMount) -> CameraSpec:
         """Returns the data sheet with the values that a robot's ``mount`` gives instead."""
         number = msgspec.structs.replace
-        spec = self
+        spec = self.coloured(mount.colour)
         if mount.field_of_view is not None:
             focal = 0.5 * self.width.value / math.tan(0.5 * mount.field_of_view)
             spec = msgspec.structs.replace(spec, fx=number(self.fx, value=focal), fy=number(self.fy, value=focal))
@@ -86,12 +96,20 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
             spec = msgspec.structs.replace(spec, nearest=near, farthest=far)
         return spec
 
+    def coloured(self, colour: str) -> CameraSpec:
+        """Returns the data sheet for pictures with the ``colour`` of :data:`COLOURS`. Raises :class:`SensorError` for
+        another word."""
+        if colour not in COLOURS:
+            raise spec_file.SensorError(f"colour is {colour!r}; give {' or '.join(COLOURS)}")
+        return self if colour == "camera" else msgspec.structs.replace(self, colour=None)
+
     def ideal(self) -> CameraSpec:
-        """Returns the data sheet of a camera like this one that measures depth exactly at any distance."""
+        """Returns the data sheet of a camera like this one that measures depth exactly at any distance and has exact
+        colours."""
         number = msgspec.structs.replace
         near = number(self.nearest, value=0.0)
         far = number(self.farthest, value=1000.0)
-        return msgspec.structs.replace(self, nearest=near, farthest=far, stereo=None)
+        return msgspec.structs.replace(self, nearest=near, farthest=far, stereo=None, colour=None)
 
     def info(self, frame_id: str, scale: float = 1.0, size: tuple[int, int] | None = None) -> CameraInfo:
         """Returns the intrinsics, with the principal point in the middle of the picture.
@@ -155,6 +173,7 @@ def load_camera_kernels() -> None:
         light_points,
         light_plants,
         tone_rows,
+        colour_response,
         stereo_rows,
     ):
         wp.load_module(module, device="cpu")
@@ -205,15 +224,22 @@ class Camera:
         self._supersampled = self.rasterizer
         if samples > 1:
             self._supersampled = CameraRasterizer(width * samples, height * samples, self.device, workers)
+        colour = self.spec.colour
+        has_flash = colour is not None and colour.flash is not None and not quality.is_live
         self._sunlight = Sunlight(
             self.sun,
             taps=quality.taps,
             period=period,
             fine=quality.shadow_texel_divisor,
+            flash=colour.flash.value if has_flash else 0.0,
             device=self.device,
             workers=workers,
         )
         self._exposure = Exposure(width, height, samples, self.exposure, self.device, workers)
+        self._response = None
+        if colour is not None:
+            rng = spec_file.noise_rng(self.seed + 2, self.name, self.image_index)
+            self._response = Response(colour, width, height, samples, self.exposure, rng, self.device, workers)
         self._live_light = LiveLight(self.rasterizer) if quality.is_live and self.device == "cpu" else None
         self._host_buffers: dict[int, wp.array] = {}
         reach = self.spec.nearest.value, self.spec.farthest.value
@@ -242,18 +268,31 @@ class Camera:
         return frame
 
     def render(
-        self, primitives: Primitives, pose: np.ndarray, time: float = 0.0, *, outputs: CameraOutput = CameraOutput.ALL
+        self,
+        primitives: Primitives,
+        pose: np.ndarray,
+        time: float = 0.0,
+        *,
+        outputs: CameraOutput = CameraOutput.ALL,
+        motion: Motion | None = None,
     ) -> CameraFrame:
         """Render a frame from ``pose`` [7], the pose of the optical frame in the world, at simulated ``time`` [s].
 
-        Only ``outputs`` are rendered; all other arrays of the frame have the size 0.
+        Only ``outputs`` are rendered; all other arrays of the frame have the size 0. ``motion``: motion during the
+        exposure, which blurs and shears the colours by the exposure time and the line delay of the data sheet. Rows of
+        labels and exact depth are those of the middle of the row's exposure. A stereo camera measures depth by global
+        shutters, in the middle of the exposure.
         """
         pose = np.array(pose, float)
         shape = (self._drawn.height, self._drawn.width)
         # the model of a stereo camera needs the texture of the picture
         is_lit = CameraOutput.RGB in outputs or (CameraOutput.DEPTH in outputs and self._stereo is not None)
         measures = self._stereo is not None and CameraOutput.DEPTH in outputs
-        picture = self.render_on_device(primitives, pose, time, is_lit=is_lit, measures=measures)
+        response = self._response if CameraOutput.RGB in outputs else None
+        picture = None
+        self._draw(primitives, pose, time, is_lit=is_lit, measures=measures)
+        if is_lit and (response is None or measures):
+            picture = self._exposure.tone_map(self._sunlight.balance, time, self._sunlight.brightness)
         lens = pinhole(self._drawn, pose)
         measured = None
         if measures and self._stereo and self.device != "cpu":
@@ -261,13 +300,14 @@ class Camera:
             measured = self._stereo.measure_on_device(primitives, lens, self.rasterizer.depth, picture)
         needs_exact = CameraOutput.EXACT_DEPTH in outputs or (CameraOutput.DEPTH in outputs and measured is None)
         rgb, exact, labels, depth = self._download(
-            picture if is_lit else None,
+            picture,
             self.rasterizer.depth if needs_exact else None,
             self.rasterizer.labels if CameraOutput.LABELS in outputs else None,
             measured,
         )
         rgb = rgb.reshape(-1, shape[1], 3)
         exact = exact.reshape(-1, shape[1])
+        labels = labels.reshape(-1, shape[1])
         if CameraOutput.DEPTH not in outputs:
             depth = np.zeros((0, 0), np.float32)
         elif measured is not None:
@@ -275,26 +315,79 @@ class Camera:
         elif self._stereo:
             depth = self._stereo.measure(primitives, lens, exact, rgb, None)
         else:
-            too_near = exact < self.spec.nearest.value
-            too_far = exact > self.spec.farthest.value
-            depth = np.where(too_near, np.float32(-np.inf), np.where(too_far, np.float32(np.inf), exact))
+            depth = self._ranged(exact)
+        if response is not None:
+            rgb = self._respond(response, primitives, pose, time, motion, labels, exact)
+            if self._stereo is None and depth.size and motion is not None:
+                depth = self._ranged(exact)
         if self.noise and CameraOutput.RGB in outputs:
             rng = spec_file.noise_rng(self.seed + 1, self.name, self.image_index)  # another one than that of the depth
             grain = 255.0 * self.noise * rng.standard_normal(rgb.shape, np.float32)
             rgb = np.clip(np.round(rgb + grain), 0.0, 255.0).astype(np.uint8)
         self.image_index += 1
+        if CameraOutput.RGB in outputs:
+            rgb = self._lens.smooth(rgb)
+            if response is not None:
+                rgb = response.compress(rgb)
         return CameraFrame(
             time=float(time),
             name=self.name,
             info=self.info,
             pose=pose,
-            rgb=self._lens.smooth(rgb) if CameraOutput.RGB in outputs else np.zeros((0, 0, 3), np.uint8),
+            rgb=rgb if CameraOutput.RGB in outputs else np.zeros((0, 0, 3), np.uint8),
             depth=self._lens.nearest(depth) if depth.size else depth,
-            labels=self._lens.nearest(labels.reshape(shape)) if labels.size else labels.reshape(0, 0),
+            labels=self._lens.nearest(labels) if labels.size else labels.reshape(0, 0),
             exact_depth=(
                 self._lens.nearest(exact) if CameraOutput.EXACT_DEPTH in outputs else np.zeros((0, 0), np.float32)
             ),
         )
+
+    def _ranged(self, exact: np.ndarray) -> np.ndarray:
+        """Returns ``exact`` depth [height, width] m with the values of REP-118 outside of the range."""
+        too_near = exact < self.spec.nearest.value
+        too_far = exact > self.spec.farthest.value
+        return np.where(too_near, np.float32(-np.inf), np.where(too_far, np.float32(np.inf), exact))
+
+    def _respond(
+        self,
+        response: Response,
+        primitives: Primitives,
+        pose: np.ndarray,
+        time: float,
+        motion: Motion | None,
+        labels: np.ndarray,
+        exact: np.ndarray,
+    ) -> np.ndarray:
+        """Returns the camera's 8-bit colours [height, width, 3] of the radiance that was drawn last.
+
+        With ``motion`` other moments are drawn too, and the rows of ``labels`` and ``exact`` depth (empty or [height,
+        width]) become those of their own exposures.
+        """
+        radiance = self._exposure.radiance
+        exposure = response.meter(radiance, time, self._sunlight.brightness)
+        light = response.light(radiance, exposure)
+        if motion is not None:
+            spec = response.spec
+            exposure_time, delay = (0.0 if n is None else n.value for n in (spec.exposure_time, spec.line_delay))
+            delay *= self.spec.height.value / len(light)
+            moments = Moments.of(motion, len(light), self._drawn.fy, exposure_time, delay)
+            share = moments.weights.astype(np.float32)[:, :, None, None]
+            middle = len(share) // 2
+            light = share[middle] * light
+            for k in np.flatnonzero(np.arange(len(share)) != middle):
+                offset = float(moments.times[k])
+                if motion.pose_scene is not None:
+                    motion.pose_scene(offset)
+                self._draw(primitives, motion.pose_at(pose, offset), time + offset)
+                light += share[k] * response.light(radiance, exposure)
+                rows = np.flatnonzero(moments.nearest == k)
+                for kept, drawn in ((labels, self.rasterizer.labels), (exact, self.rasterizer.depth)):
+                    if kept.size and len(rows):
+                        kept[rows] = drawn.numpy().reshape(kept.shape)[rows]
+            if motion.pose_scene is not None and middle:
+                motion.pose_scene(0.0)
+        rng = spec_file.noise_rng(self.seed + 3, self.name, self.image_index)
+        return response.develop(light, exposure, self._sunlight.balance, rng)
 
     def _download(self, *arrays: wp.array | None) -> list[np.ndarray]:
         """Copy device arrays to the host, with an empty array for None. A GPU copies all of them at once, through
@@ -326,8 +419,18 @@ class Camera:
         """Render from ``pose`` [7] without lens distortion and return the colours [pixel, 3] on the device.
 
         With a GPU the call returns before rendering ends. Without ``is_lit``, only depth and labels are rendered, and
-        the result is None. ``measures``: also generate the random numbers for a stereo measurement.
+        the result is None. ``measures``: also generate the random numbers for a stereo measurement. The colours are
+        exact: they do not have the camera's response.
         """
+        self._draw(primitives, pose, time, is_lit=is_lit, measures=measures)
+        if not is_lit:
+            return None
+        return self._exposure.tone_map(self._sunlight.balance, time, self._sunlight.brightness)
+
+    def _draw(
+        self, primitives: Primitives, pose: np.ndarray, time: float, *, is_lit: bool = True, measures: bool = False
+    ) -> None:
+        """Draw depth and labels, and with ``is_lit`` the radiance; see :meth:`render_on_device`."""
         if self.device == "cpu":
             load_camera_kernels()
         pose = np.array(pose, float)
@@ -339,7 +442,7 @@ class Camera:
         seen = self.rasterizer
         seen.draw(primitives, lens, beside=beside)
         if not is_lit:
-            return None
+            return
         seen = self._supersampled
         quality = self._quality
         if quality.samples > 1:
@@ -353,7 +456,6 @@ class Camera:
             shade = functools.partial(self._shade, primitives, near, far)
             seen.workers.share([functools.partial(shade, band) for band in seen.bands(lens)])
         self._exposure.add_glare(primitives, seen.primitive)
-        return self._exposure.tone_map(self._sunlight.balance, time, self._sunlight.brightness)
 
     def update_shadows(
         self, primitives: Primitives, pose: np.ndarray, time: float = 0.0

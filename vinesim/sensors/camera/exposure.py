@@ -41,6 +41,61 @@ def usual_exposure(brightness: float) -> float:
     return NOON_EXPOSURE * max(brightness, 0.01) ** -LOW_SUN_SHARE
 
 
+class LightMeter:
+    """Automatic exposure of one camera: what is metered, and how fast exposure follows."""
+
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        samples: int = 1,
+        fixed: float | None = None,
+        device: str = "cpu",
+        key: float = KEY_VALUE,
+        share: float = ADAPTED_SHARE,
+    ) -> None:
+        """``width``, ``height``: of the metered picture [sample]; ``samples``: number of samples along each side of a
+        pixel; ``fixed``: fixed exposure; ``key``: geometric mean of the exposed luminance at which it aims; ``share``:
+        of the difference to the key, in stops, that is corrected."""
+        self.width = width
+        self.height = height
+        self.fixed = fixed
+        self.device = device
+        self._step = _METERING_STRIDE * samples
+        if min(width, height) < self._step:
+            self._step = 1
+        self._key = key
+        self._share = share
+        self._sum = wp.zeros(2, dtype=wp.int64, device=device)
+        self.exposure = wp.array([fixed or 0.0], dtype=float, device=device)
+        """[1] Factor on radiance."""
+        self._time: float | None = None
+
+    def update(self, radiance: wp.array, time: float, brightness: float = 1.0) -> wp.array:
+        """Returns :attr:`exposure` for ``radiance`` [sample], rendered for ``time`` [s]; ``brightness``: of the
+        daylight, 1 at a sunny noon."""
+        if self.fixed is not None:
+            return self.exposure
+        since = np.inf if self._time is None else time - self._time
+        keep = float(np.exp(-since / ADAPTATION_TIME)) if since >= 0.0 else 0.0
+        self._time = time
+        wp.launch(
+            deferred.meter_luminance,
+            (self.width // self._step) * (self.height // self._step),
+            inputs=[radiance, self.width, self.height, self._step],
+            outputs=[self._sum],
+            device=self.device,
+        )
+        wp.launch(
+            deferred.update_exposure,
+            1,
+            inputs=[usual_exposure(brightness), self._key, self._share, MIN_EXPOSURE, MAX_EXPOSURE, keep],
+            outputs=[self._sum, self.exposure],
+            device=self.device,
+        )
+        return self.exposure
+
+
 class Exposure:
     """Exposure and tone mapping of one camera; exposure is automatic unless a ``fixed`` value is given."""
 
@@ -58,17 +113,15 @@ class Exposure:
         self.width = width
         self.height = height
         self.samples = samples
-        self.fixed = fixed
         self.device = device
         self._workers = workers or ThreadPool(1)
         self.radiance = wp.empty(width * height * samples * samples, dtype=wp.vec3, device=device)
         self._numbers = self.radiance.view(float) if device == "cpu" else None
         """View of ``radiance`` as scalars [sample, 3], for vectorised kernels; None on a GPU."""
         self._rgb = wp.empty((width * height, 3), dtype=wp.uint8, device=device)
-        self._sum = wp.zeros(2, dtype=wp.int64, device=device)
-        self._exposure = wp.array([fixed or 0.0], dtype=float, device=device)
+        self._meter = LightMeter(width * samples, height * samples, samples, fixed, device)
+        self._exposure = self._meter.exposure
         self._tone = wp.array(textures.tone_curve(), dtype=wp.uint8, device=device)
-        self._time: float | None = None
 
     def tone_map(self, balance: np.ndarray, time: float, brightness: float = 1.0) -> wp.array:
         """Convert :attr:`radiance`, rendered for ``time`` [s], to a picture [pixel, 3] uint8 on the device.
@@ -76,36 +129,7 @@ class Exposure:
         ``balance``: white balance, factors [3] on linear light; ``brightness``: brightness of the daylight, 1 at a
         sunny noon.
         """
-        if self.fixed is None:
-            since = np.inf if self._time is None else time - self._time
-            keep = float(np.exp(-since / ADAPTATION_TIME)) if since >= 0.0 else 0.0
-            self._time = time
-            step = _METERING_STRIDE * self.samples
-            across = self.width * self.samples
-            down = self.height * self.samples
-            if min(across, down) < step:
-                step = 1
-            wp.launch(
-                deferred.meter_luminance,
-                (across // step) * (down // step),
-                inputs=[self.radiance, across, down, step],
-                outputs=[self._sum],
-                device=self.device,
-            )
-            wp.launch(
-                deferred.update_exposure,
-                1,
-                inputs=[
-                    usual_exposure(brightness),
-                    KEY_VALUE,
-                    ADAPTED_SHARE,
-                    MIN_EXPOSURE,
-                    MAX_EXPOSURE,
-                    keep,
-                ],
-                outputs=[self._sum, self._exposure],
-                device=self.device,
-            )
+        self._meter.update(self.radiance, time, brightness)
         count = self._workers.size
         rows = [self.height * i // count for i in range(count + 1)]
         develop = functools.partial(self._tone_map_rows, wp.vec3(*map(float, balance)))

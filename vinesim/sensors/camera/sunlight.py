@@ -236,6 +236,11 @@ def daylight(height: float) -> tuple[np.ndarray, float]:
     return sun, 0.04 + 0.96 * float(np.clip((height + 0.1) / (_NOON_SINE + 0.1), 0.0, 1.0) ** 0.8)
 
 
+_TWILIGHT = 0.052
+"""Sine of the sun's depression, 3 degrees, over which the light of twilight falls to a tenth (civil twilight: 400 lx at
+sunset, 3.4 lx at its end, 6 degrees)."""
+
+
 @dataclasses.dataclass(frozen=True)
 class OutdoorLight:
     """Daylight for one elevation of the sun. Colours are linear RGB [3]."""
@@ -275,6 +280,13 @@ class OutdoorLight:
             (usual / usual.mean() / (falls / falls.mean())) ** _WHITE_BALANCE_SHARE,
         )
 
+    def dimmed(self, share: float) -> OutdoorLight:
+        """Returns this light without sun, with the ``share`` of all other light, for a camera with a flash: without one
+        a night is as bright as the end of the day, so that robots see something. The balance is that of white light,
+        as of the flash."""
+        other = (self.sky * share, self.haze * share, self.ground * share, self.canopy * share)
+        return OutdoorLight(np.zeros(3), *other, self.dim * share, self.brightness * share, np.ones(3))
+
 
 class Sunlight:
     """Light of sun and sky, and the two shadow maps, for one camera."""
@@ -286,16 +298,19 @@ class Sunlight:
         taps: int = 4,
         period: float = 0.2,
         fine: int = 1,
+        flash: float = 0.0,
         device: str = "cpu",
         workers: ThreadPool | None = None,
     ) -> None:
         """``sun``: vector towards the sun, or a function from simulated time [s] to that vector.
 
         ``taps``: ``shadow_taps`` of :class:`vinesim.kernels.shading.deferred.Light`; ``period``: least time [s] between
-        redraws of shadows; ``fine``: divisor of the texel size of the near shadow map.
+        redraws of shadows; ``fine``: divisor of the texel size of the near shadow map; ``flash``: ``flash`` of
+        :class:`vinesim.kernels.shading.deferred.Light` while the sun is below the horizon.
         """
         self._path: SunPath = sun if callable(sun) else lambda time: sun
         self.period = period
+        self._flash = flash
         self._device = device
         self._direction = np.zeros(3)
         self._palette = DEFAULT
@@ -332,7 +347,10 @@ class Sunlight:
         self._palette = palette
         light = self.light
         now = OutdoorLight.of(direction[2], palette)
+        if light.flash > 0.0:
+            now = now.dimmed(10.0 ** (direction[2] / _TWILIGHT))
         light.sun = _vector(direction)
+        light.flash = self._flash if direction[2] < 0.0 else 0.0
         light.sun_colour = _vector(now.sun)
         light.sky_colour = _vector(now.sky)
         light.haze_colour = _vector(now.haze)

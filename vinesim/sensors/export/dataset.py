@@ -142,6 +142,8 @@ class DatasetPlan:
 
     semantic: bool = False
     """Whether to write an image of the class of each pixel too, see :func:`annotations.encode_classes`."""
+    colour: str = "camera"
+    """Colours of the pictures, one of :data:`vinesim.sensors.camera.camera.COLOURS`."""
 
     def is_negative(self, image: int) -> bool:
         """Returns whether no bunch shall be visible in image ``image``."""
@@ -149,12 +151,13 @@ class DatasetPlan:
 
     def settings(self) -> dict[str, Any]:
         """Returns all settings that determine the images, for JSON."""
-        info = resized_intrinsics(CameraSpec.load(self.camera), self.size)
+        info = resized_intrinsics(CameraSpec.load(self.camera).coloured(self.colour), self.size)
         return {
             "vinesim": __version__,
             "scene": msgspec.to_builtins(self.scene),
             "seed": self.seed,
             "camera": self.camera,
+            "colour": self.colour,
             "size": [info.width, info.height],
             "device": self.device.partition(":")[0],  # without the index, because all GPUs render equal images
             "life": None if self.snapshot_source is None else self.snapshot_source.settings(),
@@ -188,7 +191,7 @@ class VineyardRenderer:
         self.primitives = Primitives(self.model, ripeness=self.ripeness, device=plan.device)
         self.primitives.update(self.rest)
         self.caster = RayCaster(self.primitives)
-        self.spec = CameraSpec.load(plan.camera)
+        self.spec = CameraSpec.load(plan.camera).coloured(plan.colour)
         self.info = resized_intrinsics(self.spec, plan.size)
 
     def write_image(self, image: int, folder: pathlib.Path) -> None:
