@@ -199,7 +199,8 @@ def _render_on_cluster(
         ) from None
     with client:
         futures = [
-            client.submit(_render_share, plan, out.absolute(), share, pure=False) for share in _by_vineyard(wanted, plan.images_per_vineyard)
+            client.submit(_render_share, plan, out.absolute(), share, pure=False)
+            for share in _by_vineyard(wanted, plan.images_per_vineyard)
         ]
         try:
             for future in distributed.as_completed(futures):

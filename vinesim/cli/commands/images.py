@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vinesim.cli.commands.options import Camera, Device, ImageSize, Scene, Seed, Sensors
+from vinesim.cli.commands.options import Camera, Device, ImageSize, Seed, Sensors
 
 
 def scene_show(
@@ -212,7 +212,9 @@ def dataset(
     sequence: Annotated[
         int | None,
         typer.Option(
-            min=2, max=10_000, help="Number of frames of a camera that drives along a row, with tracks and optical flow."
+            min=2,
+            max=10_000,
+            help="Frames of a camera that drives along a row, with tracks and optical flow.",
         ),
     ] = None,
 ) -> None:

@@ -304,8 +304,8 @@ def metadata_line(record: dict[str, Any]) -> str:
 
 
 def encode_flow(flow: np.ndarray) -> bytes:
-    """Returns an optical flow [height, width, 2] px, NaN where unknown, as a file of the Middlebury benchmark (``.flo``,
-    float32)."""
+    """Returns an optical flow [height, width, 2] px, NaN where unknown, as a file of the Middlebury benchmark
+    (``.flo``, float32)."""
     height, width = flow.shape[:2]
     head = np.array([_FLOW_MAGIC], "<f4").tobytes() + np.array([width, height], "<i4").tobytes()
     return head + np.where(np.isnan(flow), UNKNOWN_FLOW, flow).astype("<f4").tobytes()

@@ -1,10 +1,10 @@
 """Data sets: random pictures of random vineyards with ground truth, in files that a killed run leaves complete.
 
 The content of an image depends only on the plan and the image's index: any process may render the images, in any order,
-with equal results. The images of a sequence are frames of one camera that drives along a row. An image is complete when its record exists, which is written last, and its files have the sizes in
-the record. Files that were deleted, truncated or partly copied are rendered again. Checksums would also find changed
-bytes, but would require reading the whole data set at every start; a check of sizes needs one system call for each
-file.
+with equal results. The images of a sequence are frames of one camera that drives along a row. An image is complete when
+its record exists, which is written last, and its files have the sizes in the record. Files that were deleted, truncated
+or partly copied are rendered again. Checksums would also find changed bytes, but would require reading the whole data
+set at every start; a check of sizes needs one system call for each file.
 
 The files that trainers read (COCO, YOLO) are made of the records after the last image, in the forms that they are asked
 for. So a finished data set takes another form without rendering.
@@ -28,7 +28,6 @@ from vinesim.scene.camera_geometry import depth_millimetres
 from vinesim.scene.generation.vineyard import generate_uncached
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
-from vinesim.scene.spec import Scene
 from vinesim.scene.values import CameraInfo, RenderedMount, Snapshot
 from vinesim.sensors import ground_truth
 from vinesim.sensors.camera.camera import Camera, CameraSpec
@@ -37,8 +36,8 @@ from vinesim.sensors.export import images as picture
 from vinesim.sensors.export.files import remove_partial_files, write_files
 from vinesim.sensors.export.mix import LoadedMix, draw_entry, draw_number, draw_sun
 from vinesim.sensors.export.views import Drive, ViewFinder
-from vinesim.sensors.primitives.bunch_primitives import Ripeness
 from vinesim.sensors.ground_truth import PixelBuffers
+from vinesim.sensors.primitives.bunch_primitives import Ripeness
 from vinesim.sensors.primitives.ray_caster import RayCaster
 from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
 from vinesim.sensors.sensor import SensorSetting, export_frame
@@ -101,9 +100,7 @@ class SnapshotSource(Protocol):
         """Returns all settings that determine the scenes, for JSON."""
         ...
 
-    def snapshot(
-        self, model: Model, rng: np.random.Generator, parameters: PhysicsParameters
-    ) -> Scenery | None:
+    def snapshot(self, model: Model, rng: np.random.Generator, parameters: PhysicsParameters) -> Scenery | None:
         """Returns a snapshot, the point near which the camera shall look, and a record of the scene.
 
         None stands for the vineyard at rest. The result depends only on ``model``, its scene's ``parameters``, and the
@@ -489,7 +486,7 @@ def render_images(plan: DatasetPlan, folder: pathlib.Path, images: Iterable[int]
 
 def finish(folder: pathlib.Path, images: int, segmentation: str = "polygons", yolo: str = "detect") -> pathlib.Path:
     """Write the files that trainers read, from the records of the first ``images`` images: ``annotations.json`` (COCO),
-    for Hugging Face ``images/metadata.jsonl``, and for YOLO the folder ``labels``, ``data.yaml`` and the lists of images
+    ``images/metadata.jsonl`` (Hugging Face), and for YOLO the folder ``labels``, ``data.yaml`` and the lists of images
     that it names, one for each split that has images.
 
     Args:

@@ -12,6 +12,7 @@ here. The scene with each value that a field may have is checked when the mix is
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import pathlib
 from collections.abc import Iterator
@@ -236,7 +237,7 @@ def _check_numbers(path: pathlib.Path, mix: Mix) -> None:
 
 
 def _check_rising(source: str, numbers: list[float]) -> None:
-    if any(a > b for a, b in zip(numbers, numbers[1:], strict=False)):
+    if any(a > b for a, b in itertools.pairwise(numbers)):
         raise MixError(f"{source} is {numbers}; give rising numbers: [least, ..., largest]")
 
 
@@ -294,7 +295,7 @@ def _draw(rng: np.random.Generator, kind: msgspec.inspect.Type, value: Any) -> A
     if not all(map(_is_number, value)):
         return value[int(rng.integers(len(value)))]
     if isinstance(kind, msgspec.inspect.IntType):
-        return min(int(math.floor(draw_number(rng, (*value[:-1], value[-1] + 1)))), int(value[-1]))
+        return min(math.floor(draw_number(rng, (*value[:-1], value[-1] + 1))), int(value[-1]))
     return round(draw_number(rng, tuple(value)), 4)
 
 

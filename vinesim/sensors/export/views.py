@@ -1,5 +1,5 @@
-"""Views for the pictures of a data set: poses of a camera from which bunches are visible, drawn from a mix, and poses of
-a camera that drives along the row."""
+"""Views for the pictures of a data set: poses of a camera from which bunches are visible, drawn from a mix, and poses
+of a camera that drives along the row."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ MIN_ACTOR_SHARE = 0.01
 MIN_PLANT_SHARE = 0.02
 """Least share of the pixels of a picture without bunches that show a plant."""
 BUNCHES_PER_DRAW = 10
-"""Number of bunches that are tried with the same drawn values, so that the values of the mix are kept where possible."""
+"""Number of bunches that are tried with the same drawn values, so that the views are distributed as the mix says."""
 _MAX_TRIES = 100
 _DRAWS_PER_TRY = 20
 _TRIES_WITH_ACTORS = 30
@@ -72,7 +72,7 @@ class Drive:
         # waves of sod and tracks, GUESSED: 1.7, 0.9 and 0.4 m long
         waves = np.sin(self.phase + 2.0 * np.pi * way / np.array([1.7, 0.9, 0.4])) - np.sin(self.phase)
         heave, rock, roll = waves @ np.array([0.6, 0.3, 0.1])
-        eye = first[:3] + [way, 0.0, self.table.heave * heave]
+        eye = first[:3] + np.array([way, 0.0, self.table.heave * heave])
         eye[2] += ground_height(model.terrain, *eye[:2]) - ground_height(model.terrain, *first[:2])
         turn = frames.exp(self.table.rock * np.array([rock, 0.0, roll]))
         return frames.pose(eye, frames.multiply(first[3:], turn))
