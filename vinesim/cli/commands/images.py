@@ -11,7 +11,7 @@ from vinesim.cli.commands.options import Camera, Device, ImageSize, Seed, Sensor
 
 
 def scene_show(
-    file: Annotated[str, typer.Argument(help="A scene file, or demo, harvest, slope, tendone, vsp.")],
+    file: Annotated[str, typer.Argument(help="A scene file, or cordon, demo, harvest, slope, tendone, vsp.")],
     seed: Seed = None,
     out: Annotated[pathlib.Path | None, typer.Option(help="Picture to write; by default NAME.png.")] = None,
 ) -> None:
@@ -95,7 +95,7 @@ def export(
 
 
 def render(
-    scene: Annotated[str, typer.Argument(help="A scene file, or demo, harvest, slope, tendone, vsp.")],
+    scene: Annotated[str, typer.Argument(help="A scene file, or cordon, demo, harvest, slope, tendone, vsp.")],
     at: Annotated[str | None, typer.Option(help="Position of the camera, X,Y,Z [m].")] = None,
     look: Annotated[str | None, typer.Option(help="The point it looks at, X,Y,Z [m].")] = None,
     path: Annotated[
