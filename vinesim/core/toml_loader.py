@@ -4,6 +4,7 @@ correct it."""
 from __future__ import annotations
 
 import difflib
+import functools
 import math
 import pathlib
 import re
@@ -51,6 +52,7 @@ def to_struct(data: dict[str, Any], kind: type[T], source: str, error: type[Data
         raise error(f"{source}: {_explain(str(bad), data, kind)}") from None
 
 
+@functools.cache
 def field_type(kind: Any, path: str) -> msgspec.inspect.Type:
     """Returns the type of the field at a dotted ``path`` such as ``season.yellow`` in the struct ``kind``. Raises
     :class:`DataError` if there is no such field."""

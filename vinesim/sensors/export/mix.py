@@ -90,6 +90,8 @@ class ViewEntry(_Table, frozen=True, kw_only=True):
     """[m] Lowest and highest place of the camera above the ground."""
     bunches: Count = 1
     """Least number of bunches in view that are large enough to be annotated."""
+    visible: Share = 0.0
+    """Least visible share of the bunch, taken as an ellipse."""
 
 
 _Entry = TypeVar("_Entry", CameraEntry, ViewEntry)

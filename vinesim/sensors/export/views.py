@@ -21,6 +21,7 @@ from vinesim.sensors.export.mix import SequenceTable, ViewEntry, draw_number
 from vinesim.sensors.ground_truth import PixelBuffers
 from vinesim.sensors.primitives.ray_caster import enclosing_primitive
 from vinesim.sensors.primitives.scene_primitives import Primitives
+from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
 from vinesim.sensors.spec_file import SensorError
 
 MAX_ACTOR_DISTANCE = 2.5
@@ -33,6 +34,8 @@ MIN_PLANT_SHARE = 0.02
 """Least share of the pixels of a picture without bunches that show a plant."""
 BUNCHES_PER_DRAW = 10
 """Number of bunches that are tried with the same drawn values, so that the views are distributed as the mix says."""
+_PREVIEW_WIDTH = 160
+"""Largest width of a preview [px]."""
 _MAX_TRIES = 100
 _DRAWS_PER_TRY = 20
 _TRIES_WITH_ACTORS = 30
@@ -100,6 +103,7 @@ class ViewFinder:
         ``actors``: positions [m], one of which is in view too, unless too many tries fail.
         """
         hanging = self._hanging_bunches()
+        preview = _Preview.of(self.primitives, info)
         tries = 0
         values: dict[str, float] = {}
         for draw in range(_MAX_TRIES * _DRAWS_PER_TRY):
@@ -113,13 +117,21 @@ class ViewFinder:
                 behind = np.array(actors[rng.integers(len(actors))]) - middle[:2]
                 wanted = math.atan2(behind[1], behind[0]) + rng.normal(0.0, 0.3)
                 values["turn"], side = _turn_towards(wanted, entry, values["turn"], side)
-            pose, distance = self._place(middle, bunch, side, values, info)
+            pose, depth, distance = self._place(middle, bunch, side, values, info)
             if not self._is_free(pose, entry, distance):
                 continue
             tries += 1
-            seen = self._look(pose, info)
-            if seen is not None and self._shows(seen, bunch, entry, tries, with_actors):
-                return seen, {"bunch": bunch, "side": side, "distance": distance, **values}
+            is_choosy = tries <= _TRIES_WITH_ALL_BUNCHES
+            wanted = _Wanted(
+                bunch,
+                entry.visible * self._outline(bunch, depth, info) if is_choosy else 0.0,
+                entry.bunches if is_choosy else 1,
+                with_actors,
+            )
+            if wanted.is_in(*preview.draw(pose), preview.scale):
+                seen = ground_truth.render_buffers(self.primitives, info, pose)
+                if wanted.is_in(seen.labels, seen.depth):
+                    return seen, {"bunch": bunch, "side": side, "distance": distance, **values}
             if tries == _MAX_TRIES:
                 break
         raise ViewError(
@@ -145,8 +157,8 @@ class ViewFinder:
             pose = _pose(eye, heading, pitch, roll)
             if not self._is_way_free(pose):
                 continue
-            seen = self._look(pose, info)
-            if seen is None:
+            seen = ground_truth.render_buffers(self.primitives, info, pose)
+            if _is_obstructed(seen.depth):
                 continue
             organs = seen.labels // LABEL_STRIDE
             is_plant = (organs >= Organ.TRUNK) & (organs <= Organ.LEAF)
@@ -177,9 +189,12 @@ class ViewFinder:
 
     def _place(
         self, middle: np.ndarray, bunch: int, side: float, values: dict[str, float], info: CameraInfo
-    ) -> tuple[np.ndarray, float]:
+    ) -> tuple[np.ndarray, float, float]:
         """Returns the pose [7] of the optical frame from which ``middle`` [3] m is where ``values`` want it in the
-        picture, and its distance [m]. ``side``: side of the row on which the camera stands, 1 or -1."""
+        picture, and the depth and distance of ``middle`` [m].
+
+        ``side``: side of the row on which the camera stands, 1 or -1.
+        """
         column = (0.5 + values["across"]) * info.width - 0.5
         row = (0.5 + values["down"]) * info.height - 0.5
         ray = np.array([(column - info.cx) / info.fx, (row - info.cy) / info.fy, 1.0])
@@ -190,7 +205,13 @@ class ViewFinder:
         else:
             depth = values["distance"] / float(np.linalg.norm(ray))
         turned[:3] -= frames.rotate(turned[3:], ray * depth)
-        return turned, depth * float(np.linalg.norm(ray))
+        return turned, depth, depth * float(np.linalg.norm(ray))
+
+    def _outline(self, bunch: int, depth: float, info: CameraInfo) -> float:
+        """Returns the area [px] of a bunch at ``depth`` [m], seen from the side, as an ellipse."""
+        model = self.primitives.model
+        size = np.pi / 2.0 * float(model.bunch_length[bunch]) * float(model.bunch_radius[bunch])
+        return size * info.fx * info.fy / depth**2
 
     def _is_free(self, pose: np.ndarray, entry: ViewEntry, distance: float) -> bool:
         """Returns whether the camera may stand at ``pose`` [7]: within the limits of the mix, and not in a body."""
@@ -209,20 +230,62 @@ class ViewFinder:
             way = [self.drive.pose(pose, k, self.primitives.model) for k in range(self.drive.frames)]
         return all(enclosing_primitive(self.primitives, one[:3]) < 0 for one in way)
 
-    def _look(self, pose: np.ndarray, info: CameraInfo) -> PixelBuffers | None:
-        """Returns the view from ``pose`` [7]; None if something is too near."""
-        seen = ground_truth.render_buffers(self.primitives, info, pose)
-        return seen if (seen.depth < MIN_CLEARANCE).mean() < 0.02 else None
 
-    def _shows(self, seen: PixelBuffers, bunch: int, entry: ViewEntry, tries: int, with_actors: bool) -> bool:
-        """Returns whether a view shows what it shall: the bunch, enough bunches, and actors."""
-        is_bunch = seen.labels // LABEL_STRIDE == int(Organ.BUNCH)
-        shown, pixels = np.unique(seen.labels[is_bunch], return_counts=True)
-        large = shown[pixels >= formats.MIN_ANNOTATED_PIXELS]
-        least = entry.bunches if tries <= _TRIES_WITH_ALL_BUNCHES else 1
-        if label(Organ.BUNCH, bunch) not in large or len(large) < least:
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Preview:
+    """Small pictures of views, by which most of the unsuitable ones are rejected at a low cost."""
+
+    primitives: Primitives
+    info: CameraInfo
+    rasterizer: CameraRasterizer
+    scale: float
+    """Number of pixels of the whole picture in one of these."""
+
+    @classmethod
+    def of(cls, primitives: Primitives, info: CameraInfo) -> _Preview:
+        """Returns a preview of pictures with intrinsics ``info``, without their distortion."""
+        share = min(_PREVIEW_WIDTH / info.width, 1.0)
+        width, height = max(round(info.width * share), 1), max(round(info.height * share), 1)
+        fx, fy = (focal * share for focal in (info.fx, info.fy))
+        small = CameraInfo(width, height, fx, fy, 0.5 * (width - 1), 0.5 * (height - 1), info.frame_id)
+        rasterizer = CameraRasterizer(width, height, primitives.device)
+        return cls(primitives, small, rasterizer, share**-2)
+
+    def draw(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns labels and depth [m] of the pixels seen from ``pose`` [7]."""
+        self.rasterizer.draw(self.primitives, pinhole(self.info, pose))
+        return self.rasterizer.labels.numpy(), self.rasterizer.depth.numpy()
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Wanted:
+    """What a view shall show."""
+
+    bunch: int
+    pixels: float
+    """Least number of pixels of the bunch."""
+    bunches: int
+    """Least number of bunches that are large enough to be annotated."""
+    with_actors: bool
+
+    def is_in(self, labels: np.ndarray, depth: np.ndarray, scale: float = 1.0) -> bool:
+        """Returns whether a view with these labels and depths [m] shows it, and nothing is too near. ``scale``: number
+        of pixels that each of the given ones stands for."""
+        if _is_obstructed(depth):
             return False
-        return not with_actors or bool((seen.labels >= label(Organ.BOX, 0)).mean() >= MIN_ACTOR_SHARE)
+        shown, pixels = np.unique(labels[labels // LABEL_STRIDE == int(Organ.BUNCH)], return_counts=True)
+        pixels = pixels * scale
+        mine = float(pixels[shown == label(Organ.BUNCH, self.bunch)].sum())
+        if mine < max(self.pixels, formats.MIN_ANNOTATED_PIXELS):
+            return False
+        if (pixels >= formats.MIN_ANNOTATED_PIXELS).sum() < self.bunches:
+            return False
+        return not self.with_actors or bool((labels >= label(Organ.BOX, 0)).mean() >= MIN_ACTOR_SHARE)
+
+
+def _is_obstructed(depth: np.ndarray) -> bool:
+    """Returns whether something is too near to the camera in a view with these depths [m]."""
+    return bool((depth < MIN_CLEARANCE).mean() >= 0.02)
 
 
 def _draw_values(rng: np.random.Generator, entry: ViewEntry) -> dict[str, float]:
