@@ -64,8 +64,8 @@ def test_the_parameters_of_the_scene_are_used() -> None:
     model = sensor_scenes.demo()
     seconds = []
     for dt in (0.01, 0.02):
-        source = SceneRandomizer(1.0, PhysicsParameters(dt=dt))
-        records = [source.snapshot(model, np.random.default_rng(seed)) for seed in (1, 2)]
+        physics = PhysicsParameters(dt=dt)
+        records = [SceneRandomizer(1.0).snapshot(model, np.random.default_rng(seed), physics) for seed in (1, 2)]
         seconds.append([record[2]["wind"]["seconds"] for record in records if record and "wind" in record[2]])
     assert seconds[0]
     assert seconds[1] == [2.0 * duration for duration in seconds[0]]

@@ -20,7 +20,9 @@ def test_a_path_wins_over_a_name(tmp_path, monkeypatch):
 
 
 def test_an_unknown_name_lists_the_known_ones():
-    with pytest.raises(DataFileNotFound, match=r"no file 'moon'.*data/scenes.*demo, harvest, slope, tendone, vsp"):
+    with pytest.raises(
+        DataFileNotFound, match=r"no file 'moon'.*data/scenes.*cordon, demo, harvest, slope, tendone, vsp"
+    ):
         find_data_file("scenes", "moon", ".toml")
 
 

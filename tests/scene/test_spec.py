@@ -104,7 +104,7 @@ def test_an_error_is_one_line_with_file_place_and_remedy(error, tmp_path):
 
 
 def test_an_unknown_scene_is_refused_with_the_shipped_ones():
-    with pytest.raises(spec.SceneError, match=r"'vineyard'.*demo, harvest, slope, tendone, vsp"):
+    with pytest.raises(spec.SceneError, match=r"'vineyard'.*cordon, demo, harvest, slope, tendone, vsp"):
         spec.load_scene("vineyard")
 
 

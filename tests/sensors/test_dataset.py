@@ -33,10 +33,10 @@ from vinesim.core.errors import UsageError, WriteError
 from vinesim.core.version import __version__
 from vinesim.robot.description.urdf import DescriptionError
 from vinesim.scene.ids import Organ, label
-from vinesim.scene.spec import load_scene
 from vinesim.scene.values import MultispectralMount
-from vinesim.sensors.export import annotations, dataset
+from vinesim.sensors.export import annotations, dataset, views
 from vinesim.sensors.export.dataset import DatasetError, DatasetPlan
+from vinesim.sensors.export.mix import LoadedMix, load_mix
 from vinesim.sensors.spec_file import SensorError
 
 pytestmark = pytest.mark.slow
@@ -50,6 +50,11 @@ training = "tendone"
 layout = { rows = 1, vines = 1, row_spacing = 2.5, vine_spacing = 2.5, height = 2.0 }
 fruit = { bunches = [6, 8], varieties = ["italia"] }
 """
+
+
+def _mix(scene: str | pathlib.Path) -> LoadedMix:
+    """The mix of a data set of one scene."""
+    return load_mix("around", str(scene), "d435")
 
 
 def _files(folder: pathlib.Path) -> dict[str, bytes]:
@@ -75,7 +80,7 @@ def _command(scene: pathlib.Path, out: pathlib.Path, workers: int) -> list[str]:
 def whole(scene: pathlib.Path, tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     """A data set made in this process, in one go."""
     out = tmp_path_factory.mktemp("whole") / "set"
-    plan = DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE)
+    plan = DatasetPlan(_mix(scene), 5, (160, 120), LIFE)
     dataset.prepare_folder(plan, out, IMAGES)
     assert list(dataset.render_images(plan, out, dataset.missing_images(out, IMAGES))) == list(range(IMAGES))
     dataset.finish(out, IMAGES)
@@ -268,7 +273,7 @@ def test_yolo_poses_are_boxes_and_cut_points(whole: pathlib.Path, copy: pathlib.
 def test_a_share_of_the_images_shows_no_bunch_and_the_others_stay(
     scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:
-    plan = DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE, negatives=0.5)
+    plan = DatasetPlan(_mix(scene), 5, (160, 120), LIFE, negatives=0.5)
     assert np.mean([plan.is_negative(image) for image in range(4000)]) == pytest.approx(0.5, abs=0.03)
     dataset.prepare_folder(plan, tmp_path, IMAGES)
     list(dataset.render_images(plan, tmp_path, range(IMAGES)))
@@ -284,17 +289,17 @@ def test_a_share_of_the_images_shows_no_bunch_and_the_others_stay(
         assert (organs == Organ.BUNCH).any() == (image not in negatives)
         if image in negatives:
             assert files[f"labels/{image:06d}.txt"] == b""
-            assert np.isin(organs, [Organ.TRUNK, Organ.ARM, Organ.CANE, Organ.LEAF]).mean() >= dataset.MIN_PLANT_SHARE
+            assert np.isin(organs, [Organ.TRUNK, Organ.ARM, Organ.CANE, Organ.LEAF]).mean() >= views.MIN_PLANT_SHARE
         else:
             assert all(data == others[name] for name, data in files.items() if f"{image:06d}" in name)
     with pytest.raises(DatasetError, match=r"begun with negatives 0.5, not 0.0"):
-        dataset.prepare_folder(DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE), tmp_path, IMAGES)
+        dataset.prepare_folder(DatasetPlan(_mix(scene), 5, (160, 120), LIFE), tmp_path, IMAGES)
 
 
 def test_semantic_images_have_the_classes_of_the_ids(
     scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:
-    plan = DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE, semantic=True)
+    plan = DatasetPlan(_mix(scene), 5, (160, 120), LIFE, semantic=True)
     dataset.prepare_folder(plan, tmp_path, IMAGES)
     list(dataset.render_images(plan, tmp_path, range(IMAGES)))
     assert dataset.missing_images(tmp_path, IMAGES) == []
@@ -326,7 +331,7 @@ def test_semantic_images_have_the_classes_of_the_ids(
     (tmp_path / "semantic" / "000002.png").unlink()
     assert dataset.missing_images(tmp_path, IMAGES) == [2]
     with pytest.raises(DatasetError, match="begun with semantic True, not False"):
-        dataset.prepare_folder(DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE), tmp_path, IMAGES)
+        dataset.prepare_folder(DatasetPlan(_mix(scene), 5, (160, 120), LIFE), tmp_path, IMAGES)
 
 
 def test_unknown_forms_are_refused_in_one_line(scene: pathlib.Path, tmp_path: pathlib.Path) -> None:
@@ -407,7 +412,7 @@ def test_an_image_is_the_same_whatever_was_drawn_before(
     scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:
     """The last image of a vineyard, alone: wind, actors and picked bunches of the others leave no trace."""
-    plan = DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE)
+    plan = DatasetPlan(_mix(scene), 5, (160, 120), LIFE)
     dataset.prepare_folder(plan, tmp_path, IMAGES)
     last = dataset.IMAGES_PER_VINEYARD - 1
     list(dataset.render_images(plan, tmp_path, [last]))
@@ -423,15 +428,15 @@ def _turned(q, v: np.ndarray) -> np.ndarray:
 
 
 def test_another_plan_is_not_mixed_in(scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path) -> None:
-    plan = DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE)
+    plan = DatasetPlan(_mix(scene), 5, (160, 120), LIFE)
     before = _files(whole)
     dataset.prepare_folder(plan, whole, IMAGES)
     assert _files(whole) == before
     for other, words in (
-        (DatasetPlan(load_scene(scene), 6, "d435", (160, 120), LIFE), "seed 5, not 6"),
-        (DatasetPlan(load_scene("vsp"), 5, "d435", (160, 120), LIFE), "scene"),
-        (DatasetPlan(load_scene(scene), 5, "d435", (320, 240), LIFE), "size"),
-        (DatasetPlan(load_scene(scene), 5, "d435", (160, 120)), "life"),
+        (DatasetPlan(_mix(scene), 6, (160, 120), LIFE), "seed 5, not 6"),
+        (DatasetPlan(_mix("vsp"), 5, (160, 120), LIFE), "mix another one, not this one"),
+        (DatasetPlan(_mix(scene), 5, (320, 240), LIFE), "size"),
+        (DatasetPlan(_mix(scene), 5, (160, 120)), "life"),
     ):
         with pytest.raises(DatasetError, match=words):
             dataset.prepare_folder(other, whole, IMAGES)
@@ -444,7 +449,7 @@ def test_another_plan_is_not_mixed_in(scene: pathlib.Path, whole: pathlib.Path, 
 
 def test_a_full_disk_leaves_nothing_half(scene: pathlib.Path, tmp_path: pathlib.Path) -> None:
     """No file may grow beyond 20 kB: to a program that is a full disk, at the first picture."""
-    plan = DatasetPlan(load_scene(scene), 5, "d435", (160, 120))
+    plan = DatasetPlan(_mix(scene), 5, (160, 120))
     dataset.prepare_folder(plan, tmp_path, IMAGES)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
@@ -481,7 +486,7 @@ def test_a_failing_disk_leaves_the_image_before_whole_and_the_same_command_goes_
     """Whichever file of an image fails, none of that image is new."""
     out = tmp_path / "set"
     shutil.copytree(whole, out)
-    plan = DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE)
+    plan = DatasetPlan(_mix(scene), 5, (160, 120), LIFE)
     (out / "images" / "000001.png").unlink()
     before = _files(out)
     with pytest.MonkeyPatch.context() as patch:
@@ -507,7 +512,7 @@ def test_a_folder_that_cannot_be_written_is_refused_in_one_line(
 ) -> None:
     _full_disk(monkeypatch, "dataset.json", errno.EROFS)
     with pytest.raises(DatasetError, match="cannot be used: Read-only file system; give a folder that can be written"):
-        dataset.prepare_folder(DatasetPlan(load_scene(scene), 5, "d435"), tmp_path, 1)
+        dataset.prepare_folder(DatasetPlan(_mix(scene), 5), tmp_path, 1)
     assert not _files(tmp_path)
 
 
@@ -515,7 +520,7 @@ def test_a_folder_that_cannot_be_written_is_refused_in_one_line(
 def test_a_damaged_dataset_json_is_one_line(scene: pathlib.Path, tmp_path: pathlib.Path, text: str) -> None:
     (tmp_path / "dataset.json").write_bytes(text.encode(errors="surrogateescape"))
     with pytest.raises(DatasetError, match=r"dataset\.json is not what a data set was begun with") as said:
-        dataset.prepare_folder(DatasetPlan(load_scene(scene), 5, "d435"), tmp_path, 1)
+        dataset.prepare_folder(DatasetPlan(_mix(scene), 5), tmp_path, 1)
     assert "\n" not in str(said.value)
 
 
@@ -540,7 +545,7 @@ def test_a_damaged_file_makes_its_image_missing(whole: pathlib.Path, tmp_path: p
 def test_a_sensor_adds_its_images_and_a_damaged_one_is_missing(scene: pathlib.Path, tmp_path: pathlib.Path) -> None:
     out = tmp_path / "set"
     sensors = (MultispectralMount("bands", "optical", "rededge_mx", size=(64, 48)),)
-    plan = DatasetPlan(load_scene(scene), 5, "d435", (64, 48), sensors=sensors)
+    plan = DatasetPlan(_mix(scene), 5, (64, 48), sensors=sensors)
     dataset.prepare_folder(plan, out, 1)
     assert list(dataset.render_images(plan, out, [0])) == [0]
     assert dataset.missing_images(out, 1) == []
@@ -555,7 +560,7 @@ def test_a_sensor_adds_its_images_and_a_damaged_one_is_missing(scene: pathlib.Pa
     after = cv2.imread(str(out / "bands" / "nir" / "000000.png"), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(after, before)
     with pytest.raises(DatasetError, match="was begun with sensors"):
-        dataset.prepare_folder(DatasetPlan(load_scene(scene), 5, "d435", (64, 48)), out, 1)
+        dataset.prepare_folder(DatasetPlan(_mix(scene), 5, (64, 48)), out, 1)
 
 
 @pytest.mark.long
@@ -576,7 +581,7 @@ def test_fewer_images_than_there_are_are_refused(
     scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:
     """Lists and folders would tell of different data sets."""
-    plan = DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE)
+    plan = DatasetPlan(_mix(scene), 5, (160, 120), LIFE)
     before = _files(whole)
     with pytest.raises(DatasetError, match=r"holds image 000005, .*3 images.* give --images 6 or more") as said:
         dataset.prepare_folder(plan, whole, 3)

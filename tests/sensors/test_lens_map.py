@@ -15,11 +15,11 @@ from vinesim.core import frames
 from vinesim.core.data_files import find_data_file
 from vinesim.scene import camera_geometry
 from vinesim.scene.ids import Organ, label
-from vinesim.scene.spec import load_scene
 from vinesim.scene.values import CameraInfo
 from vinesim.sensors import ground_truth
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export import dataset
+from vinesim.sensors.export.mix import load_mix
 from vinesim.sensors.primitives.ray_caster import RayCaster
 from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
 from vinesim.sensors.raster.lens_map import lens_map
@@ -163,7 +163,7 @@ def test_a_data_set_says_and_shows_the_distortion(tmp_path: pathlib.Path) -> Non
         'fruit = { bunches = [6, 8], varieties = ["italia"] }\n'
     )
     camera = _camera_file(tmp_path, str(list(BARREL)))
-    plan = dataset.DatasetPlan(load_scene(scene), 5, camera, (160, 120))
+    plan = dataset.DatasetPlan(load_mix("around", str(scene), camera), 5, (160, 120))
     out = tmp_path / "set"
     dataset.prepare_folder(plan, out, 1)
     assert list(dataset.render_images(plan, out, [0])) == [0]

@@ -24,10 +24,11 @@ from vinesim.core.errors import UsageError, WriteError
 from vinesim.core.progress import ProgressLine
 from vinesim.kernels.compilation import SENSOR_PACKAGES, compile_kernels
 from vinesim.plants.device_buffers import find_device
-from vinesim.scene.spec import load_scene
 from vinesim.sensors.export import annotations, dataset
-from vinesim.sensors.export.dataset import DatasetError, DatasetPlan
+from vinesim.sensors.export.dataset import DatasetPlan
 from vinesim.sensors.export.files import remove_partial_files
+from vinesim.sensors.export.mix import MixError, load_mix
+from vinesim.sensors.spec_file import SensorError
 
 CONNECT_TIMEOUT = 10.0
 """Time limit for connecting to a scheduler [s]."""
@@ -54,20 +55,22 @@ def run(
     *,
     images: int,
     out: pathlib.Path,
-    scene: str,
     seed: int,
-    camera: str,
-    size: str | None,
-    workers: int | None,
-    actors: float,
-    device: str,
+    scene: str | None = None,
+    mix: str | None = None,
+    camera: str | None = None,
+    size: str | None = None,
+    workers: int | None = None,
+    actors: float | None = None,
+    device: str = "cpu",
     scheduler: str | None = None,
     sensor: Sequence[str] | None = None,
     segmentation: str = "polygons",
     yolo: str = "detect",
-    negatives: float = 0.0,
+    negatives: float | None = None,
     semantic: bool = False,
     colour: str = "camera",
+    sequence: int | None = None,
 ) -> int:
     """Render the missing images, then gather the annotations of all images. Returns the exit code."""
     if seed < 0:
@@ -76,10 +79,11 @@ def run(
         raise UsageError(
             f"--workers is {workers}, but --scheduler has workers of its own; leave one of the options out"
         )
-    if not 0.0 <= actors <= 1.0:
-        raise UsageError(f"--actors is {actors:g}: give a share of the images, 0 to 1")
-    if not 0.0 <= negatives <= 1.0:
-        raise UsageError(f"--negatives is {negatives:g}: give a share of the images, 0 to 1")
+    for option, share in (("--actors", actors), ("--negatives", negatives)):
+        if share is not None and not 0.0 <= share <= 1.0:
+            raise UsageError(f"{option} is {share:g}: give a share of the images, 0 to 1")
+    if sequence is not None and negatives is not None:
+        raise UsageError(f"--negatives is {negatives:g}, but sequences follow bunches; leave one of the options out")
     for option, given, known in (
         ("--segmentation", segmentation, annotations.SEGMENTATIONS),
         ("--yolo", yolo, annotations.YOLO_TASKS),
@@ -87,19 +91,21 @@ def run(
         if given not in known:
             raise UsageError(f"{option} is {given!r}: give {', '.join(known[:-1])} or {known[-1]}")
     find_device(device)
-    loaded = load_scene(scene)
-    randomizer = SceneRandomizer(actors, loaded.physics) if actors > 0.0 else None
+    loaded = load_mix(mix or ("default" if scene is None else "around"), scene, camera)
+    share = loaded.table.actors if actors is None else actors
+    pixels = None if size is None else parse_size(size)
+    without = loaded.table.negatives if negatives is None else negatives
     plan = DatasetPlan(
         loaded,
         seed,
-        camera,
-        None if size is None else parse_size(size),
-        randomizer,
+        pixels,
+        SceneRandomizer(share) if share > 0.0 or sequence is not None else None,
         device,
-        parse_sensors(sensor or (), None if size is None else parse_size(size)),
-        negatives,
+        parse_sensors(sensor or (), pixels),
+        0.0 if sequence is not None else without,
         semantic,
         colour,
+        sequence or 0,
     )
     running: list[Worker] = []
     try:
@@ -109,10 +115,11 @@ def run(
         if scheduler is not None:
             with _progress(images, images - len(wanted)) as advance:
                 _render_on_cluster(scheduler, plan, out, wanted, advance)
-            return _finish(out, images, len(wanted), segmentation, yolo)
+            return _finish(plan, out, images, len(wanted), segmentation, yolo)
         # With a GPU, the cores only generate vineyards, write files and compute the truth; all workers share the GPU.
         cores = os.cpu_count() or 2
-        shares = _shares(wanted, workers or max(cores // 2 if device == "cpu" else cores, 1))
+        count = workers or max(cores // 2 if device == "cpu" else cores, 1)
+        shares = _shares(wanted, count, plan.images_per_vineyard)
         running += [_start_worker(plan, out, share) for share in shares]
         with _progress(images, images - len(wanted)) as advance:
             _wait_for(running, lambda: advance(1))
@@ -123,7 +130,7 @@ def run(
         return 130
     finally:
         _stop_workers(running, out)
-    return _finish(out, images, len(wanted), segmentation, yolo)
+    return _finish(plan, out, images, len(wanted), segmentation, yolo)
 
 
 @contextlib.contextmanager
@@ -145,31 +152,31 @@ def _progress(images: int, done: int) -> Iterator[Callable[[int], None]]:
         yield show
 
 
-def _finish(out: pathlib.Path, images: int, new: int, segmentation: str, yolo: str) -> int:
+def _finish(plan: DatasetPlan, out: pathlib.Path, images: int, new: int, segmentation: str, yolo: str) -> int:
     """Write the files that trainers read, and print a summary. Returns the exit code."""
-    splits = collections.Counter(map(dataset.split_of, range(images)))
+    each = plan.images_per_vineyard
+    splits = collections.Counter(dataset.split_of(image, each) for image in range(images))
     parts = ", ".join(f"{splits[split]} {split}" for split in dataset.SPLITS)
     print(f"{dataset.finish(out, images, segmentation, yolo)}: {images} images ({parts}), {new} of them new")
     missing = [split for split in dataset.SPLITS if not splits[split]]
     if missing:
-        needs = " and ".join(f"--images {dataset.split_needs(split)} for {split}" for split in missing)
+        needs = " and ".join(f"--images {dataset.split_needs(split, each)} for {split}" for split in missing)
         print(f"data.yaml names no {' and no '.join(missing)}: splits are by vineyard; give at least {needs}")
     return 0
 
 
-def _by_vineyard(wanted: list[int]) -> list[list[int]]:
-    """Returns the numbers of images, grouped by vineyard."""
+def _by_vineyard(wanted: list[int], each: int) -> list[list[int]]:
+    """Returns the numbers of images, grouped by vineyard, of which each has ``each`` images."""
     vineyards: dict[int, list[int]] = {}
     for image in wanted:
-        vineyards.setdefault(image // dataset.IMAGES_PER_VINEYARD, []).append(image)
+        vineyards.setdefault(image // each, []).append(image)
     return list(vineyards.values())
 
 
-def _shares(wanted: list[int], workers: int) -> list[list[int]]:
-    """Returns the images of each worker, in whole vineyards where possible: generating a vineyard costs more than
-    rendering an image."""
+def _shares(wanted: list[int], workers: int, each: int) -> list[list[int]]:
+    """Returns the images of each worker, in whole vineyards of ``each`` images: a vineyard is generated once."""
     shares: list[list[int]] = [[] for _ in range(workers)]
-    for group in _by_vineyard(wanted):
+    for group in _by_vineyard(wanted, each):
         min(shares, key=len).extend(group)
     return [share for share in shares if share]
 
@@ -194,7 +201,8 @@ def _render_on_cluster(
         ) from None
     with client:
         futures = [
-            client.submit(_render_share, plan, out.absolute(), share, pure=False) for share in _by_vineyard(wanted)
+            client.submit(_render_share, plan, out.absolute(), share, pure=False)
+            for share in _by_vineyard(wanted, plan.images_per_vineyard)
         ]
         try:
             for future in distributed.as_completed(futures):
@@ -232,7 +240,7 @@ def _run_worker(plan: DatasetPlan, out: pathlib.Path, share: list[int], pipe: Co
             pipe.send(image)
     except BrokenPipeError:
         return
-    except (DatasetError, WriteError) as bad:
+    except (SensorError, MixError, WriteError) as bad:
         pipe.send(bad)
 
 

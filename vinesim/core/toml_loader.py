@@ -4,6 +4,7 @@ correct it."""
 from __future__ import annotations
 
 import difflib
+import functools
 import math
 import pathlib
 import re
@@ -39,10 +40,36 @@ def load_toml(path: pathlib.Path, kind: type[T], error: type[DataError] = DataEr
     for place, value in _leaves(data):
         if isinstance(value, float) and not math.isfinite(value):
             raise error(f"{path}: {place} is {value}; give a finite number")
+    return to_struct(data, kind, str(path), error)
+
+
+def to_struct(data: dict[str, Any], kind: type[T], source: str, error: type[DataError] = DataError) -> T:
+    """Returns the table ``data`` as an object of the class ``kind``. Raises ``error`` if it does not fit; the message
+    begins with ``source``."""
     try:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as bad:
-        raise error(f"{path}: {_explain(str(bad), data, kind)}") from None
+        raise error(f"{source}: {_explain(str(bad), data, kind)}") from None
+
+
+@functools.cache
+def field_type(kind: Any, path: str) -> msgspec.inspect.Type:
+    """Returns the type of the field at a dotted ``path`` such as ``season.yellow`` in the struct ``kind``. Raises
+    :class:`DataError` if there is no such field."""
+    at = _present(msgspec.inspect.type_info(kind))
+    for word in path.split("."):
+        known = {f.encode_name: f.type for f in at.fields} if isinstance(at, msgspec.inspect.StructType) else {}
+        if word not in known:
+            raise DataError(f"{path}: {word} is not a field; {_remedy(word, list(known))}")
+        at = _present(known[word])
+    return at
+
+
+def _remedy(name: str, known: list[str], hint: str = "") -> str:
+    """Returns what to do about the unknown field ``name``: the ``hint``, or the known name that is most like it."""
+    near = difflib.get_close_matches(name, known, 1, 0.5)
+    hint = hint or (f"did you mean {near[0]!r}?" if near else "remove it")
+    return f"{hint} (known: {', '.join(known)})"
 
 
 def _one_line(bad: Exception) -> str:
@@ -72,12 +99,9 @@ def _explain(message: str, data: Any, kind: Any) -> str:
     named = f"{place}." if place else ""
     quoted = re.findall(r"`([^`]*)`", what)
     if "unknown field" in what:
-        known = _fields(kind, steps)
-        near = difflib.get_close_matches(quoted[0], known, 1, 0.5)
-        hint = f"did you mean {near[0]!r}?" if near else "remove it"
-        if steps and quoted[0] in _fields(kind, []):
-            hint = "it belongs to no table: write it above the first [...] of the file"
-        return f"{named}{quoted[0]} is not a field; {hint} (known: {', '.join(known)})"
+        is_above = bool(steps) and quoted[0] in _fields(kind, [])
+        hint = "it belongs to no table: write it above the first [...] of the file" if is_above else ""
+        return f"{named}{quoted[0]} is not a field; {_remedy(quoted[0], _fields(kind, steps), hint)}"
     if "missing required field" in what:
         return f"{named}{quoted[0]} is missing; add it: {quoted[0]} = ..."
     if place and what.startswith(f"{place}."):  # the message comes from the struct's own check and names the field

@@ -170,6 +170,8 @@ class LeafNodes:
     """[..., 3] direction perpendicular to the plane in which leaves stand on both sides of the axis."""
     hand: np.ndarray
     """[..., 1] side of the leaf, 1 or -1."""
+    reach: np.ndarray
+    """[...] m, distance of the node from the base of its shoot."""
     grown: np.ndarray
     """[...] ratio of the area of a grown leaf at this node to the area on a main axis."""
 
@@ -218,8 +220,10 @@ def grow_leaves(
     pose = np.concatenate([blade, frames.multiply(frames.conjugate(turn), frames.from_x_axis(midrib, upper))], -1)
     age = np.where(turned < scene.season.yellow, 0.75, 0.05 + 0.45 * (1.0 - share)) + 0.08 * ageing[..., 0]
     mass = leaf.mass_per_area.value * area + leaf.petiole_mass.value * np.sqrt(shrink)
+    season = scene.season
+    stay = season.leafiness * np.where(nodes.reach < season.fruit_zone, season.fruit_zone_leafiness, 1.0)
     return {
-        "present": fate < scene.season.leafiness,
+        "present": fate < stay,
         "base": base,
         "pose": pose,
         "area": area,

@@ -108,6 +108,11 @@ class Season(_Part, frozen=True, kw_only=True):
     """Share of the nodes that still carry their leaf."""
     yellow: Share = 0.05
     """Share of the leaves that are yellow."""
+    fruit_zone_leafiness: Share = 1.0
+    """Share of the leaves in the fruit zone that are left after leaf pulling."""
+    fruit_zone: Annotated[float, msgspec.Meta(ge=0.0, le=2.0)] = 0.35
+    """[m] Distance from the base of its shoot within which a leaf is in the fruit zone; on upright shoots this is the
+    height above the cordon. Hedges are pulled 0.3 to 0.4 m high (GUESSED from photographs)."""
 
 
 class Clutter(_Part, frozen=True, kw_only=True):
@@ -300,10 +305,14 @@ def load_scene(path_or_name: str | pathlib.Path, seed: int | None = None) -> Sce
     if scene.terrain is not None and scene.terrain.image is not None:
         image = str(_beside(path, scene.terrain.image))
         scene = msgspec.structs.replace(scene, terrain=msgspec.structs.replace(scene.terrain, image=image))
-    trouble = _find_error(scene)
-    if trouble:
-        raise SceneError(f"{path}: {trouble}")
-    return with_seed(scene, seed)
+    return with_seed(check_scene(scene, str(path)), seed)
+
+
+def check_scene(scene: Scene, source: str) -> Scene:
+    """Returns ``scene`` if it is valid. Raises :class:`SceneError` otherwise; the message begins with ``source``."""
+    if trouble := _find_error(scene):
+        raise SceneError(f"{source}: {trouble}")
+    return scene
 
 
 def _beside(scene: pathlib.Path, file: str) -> pathlib.Path:

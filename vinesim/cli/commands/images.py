@@ -7,11 +7,11 @@ from typing import Annotated
 
 import typer
 
-from vinesim.cli.commands.options import Camera, Colour, Device, ImageSize, Scene, Seed, Sensors
+from vinesim.cli.commands.options import Camera, Colour, Device, ImageSize, Seed, Sensors
 
 
 def scene_show(
-    file: Annotated[str, typer.Argument(help="A scene file, or demo, harvest, slope, tendone, vsp.")],
+    file: Annotated[str, typer.Argument(help="A scene file, or cordon, demo, harvest, slope, tendone, vsp.")],
     seed: Seed = None,
     out: Annotated[pathlib.Path | None, typer.Option(help="Picture to write; by default NAME.png.")] = None,
 ) -> None:
@@ -95,7 +95,7 @@ def export(
 
 
 def render(
-    scene: Annotated[str, typer.Argument(help="A scene file, or demo, harvest, slope, tendone, vsp.")],
+    scene: Annotated[str, typer.Argument(help="A scene file, or cordon, demo, harvest, slope, tendone, vsp.")],
     at: Annotated[str | None, typer.Option(help="Position of the camera, X,Y,Z [m].")] = None,
     look: Annotated[str | None, typer.Option(help="The point it looks at, X,Y,Z [m].")] = None,
     path: Annotated[
@@ -179,9 +179,17 @@ def dataset(
         int, typer.Option(min=1, max=999_999, help="Number of images, at least as many as OUT contains.")
     ],
     out: Annotated[pathlib.Path, typer.Option(help="Folder of the data set; an unfinished data set is continued.")],
-    scene: Scene = "demo",
+    mix: Annotated[
+        str | None,
+        typer.Option(help="A mix file, or the name of a shipped mix: around, default. With --scene: around."),
+    ] = None,
+    scene: Annotated[
+        str | None, typer.Option(help="A scene file or the name of a shipped scene, instead of the scenes of the mix.")
+    ] = None,
     seed: Annotated[int, typer.Option(help="The same seed gives the same images.")] = 0,
-    camera: Camera = "d435",
+    camera: Annotated[
+        str | None, typer.Option(help="A camera file, or d435, pinhole, instead of the cameras of the mix.")
+    ] = None,
     sensor: Sensors = None,
     colour: Colour = "camera",
     size: ImageSize = None,
@@ -199,11 +207,13 @@ def dataset(
     ] = None,
     device: Device = "cpu",
     actors: Annotated[
-        float, typer.Option(help="Share of the images with people, robots, crates and wind; 0: vines only.")
-    ] = 0.4,
+        float | None,
+        typer.Option(help="Share of the images with people, robots, crates and wind, instead of the mix's; 0: vines."),
+    ] = None,
     negatives: Annotated[
-        float, typer.Option(help="Share of the images in which no bunch is visible, with empty labels.")
-    ] = 0.0,
+        float | None,
+        typer.Option(help="Share of the images in which no bunch is visible, with empty labels, instead of the mix's."),
+    ] = None,
     segmentation: Annotated[
         str, typer.Option(help="Masks in COCO: polygons, rle (a list of run lengths) or compressed (RLE as text).")
     ] = "polygons",
@@ -211,10 +221,19 @@ def dataset(
         str, typer.Option(help="Labels for YOLO: detect (boxes), segment (polygons) or pose (boxes and cut points).")
     ] = "detect",
     semantic: Annotated[bool, typer.Option("--semantic", help="Write an image of each pixel's class, too.")] = False,
+    sequence: Annotated[
+        int | None,
+        typer.Option(
+            min=2,
+            max=10_000,
+            help="Frames of a camera that drives along a row, with tracks and optical flow.",
+        ),
+    ] = None,
 ) -> None:
     """Render random pictures of random vineyards with their ground truth: COCO with masks, YOLO, depth, ids, poses.
 
-    Seed of the vines, leaves, varieties, ripeness, hour and season of the sun, actors and the viewpoint are random.
+    Scenes, vines, leaves, varieties, ripeness, sun, cameras and viewpoints are drawn from a mix, a TOML file, and
+    actors and ripeness at random. With --scene alone all pictures are of that scene, from all sides of its bunches.
     After an interruption the same command continues, and renders deleted or truncated images again. A later run may
     ask for more images; fewer are refused. It may also ask for other masks and labels, which are made without
     rendering. The five images of a vineyard are in one split. Of every ten
@@ -226,6 +245,7 @@ def dataset(
       vinesim dataset --images 1000 --out grapes --yolo segment
       vinesim dataset --images 100000 --out /shared/grapes --scheduler tcp://HOST:8786
       vinesim dataset --images 200 --out vsp --scene vsp --seed 3 --camera pinhole --size 320x240 --workers 4
+      vinesim dataset --images 300 --out drives --sequence 30
     """
     options = dict(locals())
     from vinesim.cli.dataset import run

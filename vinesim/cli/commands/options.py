@@ -9,7 +9,7 @@ import typer
 
 Seed = Annotated[int | None, typer.Option(help="Seed of the vineyard, instead of the scene's own.")]
 Scene = Annotated[
-    str, typer.Option(help="A scene file, or the name of a shipped scene: demo, harvest, slope, tendone, vsp.")
+    str, typer.Option(help="A scene file, or the name of a shipped scene: cordon, demo, harvest, slope, tendone, vsp.")
 ]
 Device = Annotated[str, typer.Option(help="cpu, cuda or cuda:N (an NVIDIA GPU).")]
 Camera = Annotated[str, typer.Option(help="A camera file, or d435, phone, pinhole, raspberry_pi.")]

@@ -6,6 +6,7 @@ A scene depends only on the random numbers of its image; nothing is kept from on
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -49,32 +50,54 @@ class SceneRandomizer:
     """Composes random scenes; implements :class:`vinesim.sensors.export.dataset.SnapshotSource`."""
 
     share: float = 0.4
-    """Fraction of the images with actors or wind."""
-    parameters: PhysicsParameters = dataclasses.field(default_factory=PhysicsParameters)
-    """Physics parameters of the models' scene."""
+    """Fraction of the images, or sequences, with actors."""
 
     def settings(self) -> dict[str, Any]:
         """All settings that determine the scenes, as JSON values."""
         return {"share": self.share, "robots": list(ROBOT_NAMES)}
 
-    def snapshot(self, model: Model, rng: np.random.Generator) -> tuple[Snapshot, np.ndarray, dict[str, Any]] | None:
+    def snapshot(
+        self, model: Model, rng: np.random.Generator, parameters: PhysicsParameters = PhysicsParameters()
+    ) -> tuple[Snapshot, np.ndarray, dict[str, Any]] | None:
         """Returns a snapshot of a random scene, see :meth:`vinesim.sensors.export.dataset.SnapshotSource.snapshot`."""
-        if rng.uniform() >= self.share:
+        if rng.uniform() >= self.share or (staged := _stage(model, rng, parameters)) is None:
             return None
-        bunch = int(rng.integers(len(model.bunch_body)))
-        middle = model.forward_kinematics(model.joint_settled)[model.bunch_body[bunch], :2].astype(float)
-        for _ in range(_MAX_TRIES):
-            stage = random_composition(model, middle, rng)
-            physics = Physics(stage.with_crates(model), parameters=self.parameters)
-            try:
-                stage.populate(physics)
-            except PlacementError:
-                continue
-            happens: dict[str, Any] = {"actors": stage.actor_records(model)}
-            if rng.uniform() < WIND_SHARE:
-                happens["wind"] = _simulate_wind(physics, rng)
-            return Sway(model).apply(physics.snapshot()), middle, happens
-        return None
+        physics, middle, happens = staged
+        if rng.uniform() < WIND_SHARE:
+            happens["wind"] = _simulate_wind(physics, rng)
+        return Sway(model).apply(physics.snapshot()), middle, happens
+
+    def frames(
+        self, model: Model, rng: np.random.Generator, parameters: PhysicsParameters, period: float
+    ) -> Iterator[tuple[Snapshot, np.ndarray | None, dict[str, Any]]]:
+        """Yield states of a random scene with wind, see
+        :meth:`vinesim.sensors.export.dataset.SnapshotSource.frames`."""
+        staged = _stage(model, rng, parameters) if rng.uniform() < self.share else None
+        physics, middle, happens = staged or (Physics(model, parameters=parameters), None, {})
+        happens["wind"] = _simulate_wind(physics, rng)
+        sway = Sway(model)
+        while True:
+            yield sway.apply(physics.snapshot()), middle, dict(happens)
+            for _ in range(round(period / physics.dt)):
+                physics.step()
+
+
+def _stage(
+    model: Model, rng: np.random.Generator, parameters: PhysicsParameters
+) -> tuple[Physics, np.ndarray, dict[str, Any]] | None:
+    """Returns physics with random actors around a random bunch, the bunch's place [2] m, and a record; None if no
+    actors fit."""
+    bunch = int(rng.integers(len(model.bunch_body)))
+    middle = model.forward_kinematics(model.joint_settled)[model.bunch_body[bunch], :2].astype(float)
+    for _ in range(_MAX_TRIES):
+        stage = random_composition(model, middle, rng)
+        physics = Physics(stage.with_crates(model), parameters=parameters)
+        try:
+            stage.populate(physics)
+        except PlacementError:
+            continue
+        return physics, middle, {"actors": stage.actor_records(model)}
+    return None
 
 
 def random_composition(model: Model, middle: np.ndarray, rng: np.random.Generator) -> SceneComposer:

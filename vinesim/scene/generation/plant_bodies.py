@@ -266,9 +266,13 @@ def place_leaves(scene: Scene, parameters: VineParameters, shoots: Shoots, bodie
     piece = (share * pieces).astype(int)
     slot = np.where(main, piece, AXIS_SEGMENTS + piece)
     rows = np.arange(len(shoots.vine))[:, None]
+    turn = bodies.turn[rows, slot]
+    along = (share * pieces - piece) * bodies.length[rows, slot]
+    place = bodies.origin[rows, slot] + frames.rotate(turn, along[..., None] * [1.0, 0.0, 0.0])
     nodes = LeafNodes(
-        turn=bodies.turn[rows, slot],
-        along=(share * pieces - piece) * bodies.length[rows, slot],
+        turn=turn,
+        along=along,
+        reach=np.linalg.norm(place - bodies.origin[:, :1], axis=-1),
         thick=bodies.radius[rows, slot, 0],
         share=share,
         up=shoots.up[:, None],

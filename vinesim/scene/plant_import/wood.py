@@ -220,7 +220,9 @@ def _tree(
         nodes = find_nodes(points.parent, points.radius, way, inside, parameters.cane)
         body = np.array([bodies[piece] for piece in nodes.piece.tolist()], int)
         turn = np.array([turns[piece] for piece in nodes.piece.tolist()], float).reshape(-1, 4)
-        add_leaves(tree, nodes, body, turn, leaves[0], parameters.leaf, leaves[1])
+        start, end = place[points.parent[nodes.piece]], place[nodes.piece]
+        reach = np.linalg.norm(start + nodes.share[:, None] * (end - start) - place[below], axis=1)
+        add_leaves(tree, nodes, body, turn, reach, leaves[0], parameters.leaf, leaves[1])
     return tree
 
 
@@ -326,6 +328,7 @@ def add_leaves(
     nodes: Nodes,
     body: np.ndarray,
     turn: np.ndarray,
+    reach: np.ndarray,
     scene: Scene,
     leaf: Leaf,
     rng: np.random.Generator,
@@ -337,6 +340,7 @@ def add_leaves(
         nodes: nodes at which leaves grow.
         body: [k] body of each node's piece.
         turn: [k, 4] orientation of that body in the world.
+        reach: [k] m, distance of each node from the base of the tree.
         scene: its season and training are used.
         leaf: parameters of leaves.
         rng: random numbers for the leaves of this tree.
@@ -362,6 +366,7 @@ def add_leaves(
             thick=thick[:, 0] + nodes.share * (thick[:, 1] - thick[:, 0]),
             share=nodes.axis_share,
             up=np.where(is_along[:, None], other, up),
+            reach=reach,
             hand=np.where(nodes.rank % 2, 1.0, -1.0)[:, None],
             grown=np.where(nodes.lateral, LATERAL_AREA, 1.0),
         ),

@@ -37,6 +37,11 @@ SEGMENTATIONS = ("polygons", "rle", "compressed")
 YOLO_TASKS = ("detect", "segment", "pose")
 """Forms of YOLO label files, by the names of Ultralytics' tasks: box, polygon, and box with cut point."""
 
+UNKNOWN_FLOW = 1e10
+"""Optical flow [px] of pixels without one, in files of the Middlebury benchmark; its readers take 1e9 as the limit."""
+_FLOW_MAGIC = 202021.25
+"""First number of these files."""
+
 SEMANTIC_CLASSES = (
     "sky",
     "soil",
@@ -227,6 +232,8 @@ def coco_json(read: Callable[[], Iterable[dict[str, Any]]], seed: int, segmentat
     }
     yield f'{{"info": {json.dumps(info)},\n"licenses": {json.dumps(LICENSES)},\n'
     yield f'"categories": {json.dumps(CATEGORIES)},\n"images": ['
+    videos: dict[int, dict[str, float]] = {}
+    tracks: dict[tuple[int, int], int] = {}
     for number, one in enumerate(read()):
         image = {
             "id": one["image"],
@@ -237,14 +244,25 @@ def coco_json(read: Callable[[], Iterable[dict[str, Any]]], seed: int, segmentat
             "split": one["split"],
             "camera": one["camera"],
         }
+        if "sequence" in one:
+            image |= {"video_id": one["sequence"]["number"], "frame_id": one["sequence"]["frame"]}
+            videos.setdefault(one["sequence"]["number"], {"fps": 1.0 / one["sequence"]["period"]})
         yield (",\n" if number else "\n") + json.dumps(image)
     yield '],\n"annotations": ['
     number = 0
     for one in read():
         for bunch in annotated_bunches(one["bunches"]):
-            yield (",\n" if number else "\n") + json.dumps(_annotation(number + 1, one, bunch, segmentation))
+            annotation = _annotation(number + 1, one, bunch, segmentation)
+            if "sequence" in one:
+                video = one["sequence"]["number"]
+                annotation |= {
+                    "video_id": video,
+                    "track_id": tracks.setdefault((video, bunch["bunch"]), len(tracks) + 1),
+                }
+            yield (",\n" if number else "\n") + json.dumps(annotation)
             number += 1
-    yield "]}\n"
+    listed = [{"id": number, "name": f"{number:06d}", **video} for number, video in videos.items()]
+    yield f'],\n"videos": {json.dumps(listed)}}}\n' if listed else "]}\n"
 
 
 def _annotation(number: int, image: dict[str, Any], bunch: dict[str, Any], segmentation: str) -> dict[str, Any]:
@@ -263,6 +281,34 @@ def _annotation(number: int, image: dict[str, Any], bunch: dict[str, Any], segme
         "amodal_segmentation": bunch["amodal_mask"],
         **{name: bunch[name] for name in _EXTRA_FIELDS},
     }
+
+
+def metadata_line(record: dict[str, Any]) -> str:
+    """Returns the line of ``metadata.jsonl`` for an image, from its record: what Hugging Face ``datasets`` reads beside
+    images, with boxes as in COCO and category 0, ``bunch``."""
+    shown = annotated_bunches(record["bunches"])
+    line = {
+        "file_name": record["file"].partition("/")[2],
+        "image_id": record["image"],
+        "split": record["split"],
+        "width": record["camera"]["width"],
+        "height": record["camera"]["height"],
+        "objects": {
+            "id": [one["bunch"] for one in shown],
+            "bbox": [[float(value) for value in one["box"]] for one in shown],
+            "area": [one["pixels"] for one in shown],
+            "categories": [0] * len(shown),
+        },
+    }
+    return json.dumps(line) + "\n"
+
+
+def encode_flow(flow: np.ndarray) -> bytes:
+    """Returns an optical flow [height, width, 2] px, NaN where unknown, as a file of the Middlebury benchmark
+    (``.flo``, float32)."""
+    height, width = flow.shape[:2]
+    head = np.array([_FLOW_MAGIC], "<f4").tobytes() + np.array([width, height], "<i4").tobytes()
+    return head + np.where(np.isnan(flow), UNKNOWN_FLOW, flow).astype("<f4").tobytes()
 
 
 def _segmentation(bunch: dict[str, Any], form: str) -> Any:

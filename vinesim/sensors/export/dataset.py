@@ -1,10 +1,10 @@
 """Data sets: random pictures of random vineyards with ground truth, in files that a killed run leaves complete.
 
 The content of an image depends only on the plan and the image's index: any process may render the images, in any order,
-with equal results. An image is complete when its record exists, which is written last, and its files have the sizes in
-the record. Files that were deleted, truncated or partly copied are rendered again. Checksums would also find changed
-bytes, but would require reading the whole data set at every start; a check of sizes needs one system call for each
-file.
+with equal results. The images of a sequence are frames of one camera that drives along a row. An image is complete when
+its record exists, which is written last, and its files have the sizes in the record. Files that were deleted, truncated
+or partly copied are rendered again. Checksums would also find changed bytes, but would require reading the whole data
+set at every start; a check of sizes needs one system call for each file.
 
 The files that trainers read (COCO, YOLO) are made of the records after the last image, in the forms that they are asked
 for. So a finished data set takes another form without rendering.
@@ -13,6 +13,7 @@ for. So a finished data set takes another form without rendering.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import pathlib
 from collections.abc import Iterable, Iterator
@@ -21,24 +22,23 @@ from typing import Any, Protocol
 import msgspec
 import numpy as np
 
-from vinesim.core import frames
 from vinesim.core.errors import WriteError
 from vinesim.core.version import __version__
-from vinesim.scene.berries import VARIETIES
 from vinesim.scene.camera_geometry import depth_millimetres
 from vinesim.scene.generation.vineyard import generate_uncached
-from vinesim.scene.ids import LABEL_STRIDE, Organ, label
 from vinesim.scene.model import Model
-from vinesim.scene.spec import Scene, Season, sun_direction
-from vinesim.scene.terrain import ground_height
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.values import CameraInfo, RenderedMount, Snapshot
 from vinesim.sensors import ground_truth
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export import annotations as formats
 from vinesim.sensors.export import images as picture
 from vinesim.sensors.export.files import remove_partial_files, write_files
+from vinesim.sensors.export.mix import LoadedMix, draw_entry, draw_number, draw_sun
+from vinesim.sensors.export.views import Drive, ViewFinder
+from vinesim.sensors.ground_truth import PixelBuffers
 from vinesim.sensors.primitives.bunch_primitives import Ripeness
-from vinesim.sensors.primitives.ray_caster import RayCaster, enclosing_primitive
+from vinesim.sensors.primitives.ray_caster import RayCaster
 from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
 from vinesim.sensors.sensor import SensorSetting, export_frame
 from vinesim.sensors.spec_file import SensorError
@@ -48,28 +48,10 @@ IMAGES_PER_VINEYARD = 5
 MIN_IMAGE_SIZE = 16
 MAX_IMAGE_SIZE = 4096
 """Largest width and height of pictures [px]; ``MIN_IMAGE_SIZE`` is the smallest."""
-CAMERA_HEIGHT = (0.7, 1.7)
-"""Lowest and highest height of the camera above the ground [m], as on arms and heads of robots."""
-BUNCH_DISTANCE = (0.35, 1.8)
-"""Least and largest distance [m] from the camera to the bunch at which it looks."""
-MAX_ACTOR_DISTANCE = 2.5
-"""Largest horizontal distance [m] from the actors' place of work to the bunch in view."""
-MIN_CLEARANCE = 0.15
-"""Depth [m] below which at most a fiftieth of a picture's pixels may be; other views are rejected."""
-LATITUDE = np.radians(41.6)
-"""Latitude [rad] of the vineyards near Aprilia, Italy, where CANOPIES picks; it determines the sun's path."""
-MIN_ACTOR_SHARE = 0.01
-"""Least share of a picture's pixels that show actors or boxes, in scenes that have any."""
-MIN_PLANT_SHARE = 0.02
-"""Least share of the pixels of a picture without bunches that show a plant."""
-_MAX_TRIES = 60
-_TRIES_WITH_ACTORS = 30
-_TRIES_WITHOUT_BUNCHES = 300
-_TRIES_UNTIL_DOWN = 60
 _FOLDERS = ("images", "labels", "depth", "measured", "ids", "berries", "records")
 _DERIVED_FOLDERS = ("labels", "records")
 """Folders without files that an image's record lists."""
-_SUFFIXES = {"labels": ".txt", "records": ".json"}
+_SUFFIXES = {"labels": ".txt", "records": ".json", "flow": ".flo"}
 """File suffixes in the folders of a data set that do not contain PNG files."""
 SPLITS = ("train", "val", "test")
 _VAL_VINEYARD = 1
@@ -82,15 +64,16 @@ class DatasetError(SensorError):
     """Error: a data set cannot be made or continued. The message is one line."""
 
 
-def split_of(image: int) -> str:
-    """Returns the split (``train``, ``val``, ``test``) of an image; all images of a vineyard belong to one split."""
-    place = image // IMAGES_PER_VINEYARD % _SPLIT_PERIOD
+def split_of(image: int, each: int = IMAGES_PER_VINEYARD) -> str:
+    """Returns the split (``train``, ``val``, ``test``) of an image; all images of a vineyard, of which there are
+    ``each``, belong to one split."""
+    place = image // each % _SPLIT_PERIOD
     return {_VAL_VINEYARD: "val", _TEST_VINEYARD: "test"}.get(place, "train")
 
 
-def split_needs(split: str) -> int:
-    """Returns the smallest number of images with which a split is not empty."""
-    return next(image + 1 for image in range(IMAGES_PER_VINEYARD * _SPLIT_PERIOD) if split_of(image) == split)
+def split_needs(split: str, each: int = IMAGES_PER_VINEYARD) -> int:
+    """Returns the smallest number of images with which a split is not empty; ``each``: as in :func:`split_of`."""
+    return next(image + 1 for image in range(each * _SPLIT_PERIOD) if split_of(image, each) == split)
 
 
 def resized_intrinsics(spec: CameraSpec, size: tuple[int, int] | None) -> CameraInfo:
@@ -105,6 +88,10 @@ def resized_intrinsics(spec: CameraSpec, size: tuple[int, int] | None) -> Camera
     return spec.info("camera_optical_frame", size=size)
 
 
+Scenery = tuple[Snapshot, np.ndarray | None, dict[str, Any]]
+"""A snapshot; the point [2] m of the ground near which the camera shall look, or None; and a record of the scene."""
+
+
 class SnapshotSource(Protocol):
     """Interface of a generator of random scenes with actors and wind, which provides the snapshots that sensors
     render."""
@@ -113,13 +100,19 @@ class SnapshotSource(Protocol):
         """Returns all settings that determine the scenes, for JSON."""
         ...
 
-    def snapshot(self, model: Model, rng: np.random.Generator) -> tuple[Snapshot, np.ndarray, dict[str, Any]] | None:
-        """Returns a snapshot, the point [2] m of the ground near which the camera shall look, and a record of the
-        scene.
+    def snapshot(self, model: Model, rng: np.random.Generator, parameters: PhysicsParameters) -> Scenery | None:
+        """Returns a snapshot, the point near which the camera shall look, and a record of the scene.
 
-        None stands for the vineyard at rest. The result depends only on ``model`` and the random numbers of ``rng``.
-        Entry ``actors`` of the record has the form that :func:`formats.actor_records` takes.
+        None stands for the vineyard at rest. The result depends only on ``model``, its scene's ``parameters``, and the
+        random numbers of ``rng``. Entry ``actors`` of the record has the form that :func:`formats.actor_records` takes.
         """
+        ...
+
+    def frames(
+        self, model: Model, rng: np.random.Generator, parameters: PhysicsParameters, period: float
+    ) -> Iterator[Scenery]:
+        """Yield, without end, what :meth:`snapshot` returns, for the frames of a sequence with wind: ``period`` [s]
+        after each other."""
         ...
 
 
@@ -127,11 +120,11 @@ class SnapshotSource(Protocol):
 class DatasetPlan:
     """The settings of a data set. Equal plans have equal images."""
 
-    scene: Scene
+    mix: LoadedMix
+    """What vineyards, cameras, views and light are drawn from."""
     seed: int
-    camera: str
     size: tuple[int, int] | None = None
-    """Width and height of the pictures [px]; None: those of the camera."""
+    """Width and height of the pictures [px]; None: those of the mix or the camera."""
     snapshot_source: SnapshotSource | None = None
     """Generator of scenes with actors and wind; None: all plants hang at rest."""
     device: str = "cpu"
@@ -144,6 +137,13 @@ class DatasetPlan:
     """Whether to write an image of the class of each pixel too, see :func:`annotations.encode_classes`."""
     colour: str = "camera"
     """Colours of the pictures, one of :data:`vinesim.sensors.camera.camera.COLOURS`."""
+    sequence: int = 0
+    """Number of frames of each sequence; 0: single pictures."""
+
+    @property
+    def images_per_vineyard(self) -> int:
+        """Number of images of one vineyard: five single pictures, or one sequence."""
+        return self.sequence or IMAGES_PER_VINEYARD
 
     def is_negative(self, image: int) -> bool:
         """Returns whether no bunch shall be visible in image ``image``."""
@@ -151,30 +151,59 @@ class DatasetPlan:
 
     def settings(self) -> dict[str, Any]:
         """Returns all settings that determine the images, for JSON."""
-        info = resized_intrinsics(CameraSpec.load(self.camera).coloured(self.colour), self.size)
+        for entry in self.mix.table.cameras:
+            resized_intrinsics(CameraSpec.load(entry.camera).coloured(self.colour), self.size or entry.size)
         return {
             "vinesim": __version__,
-            "scene": msgspec.to_builtins(self.scene),
+            "mix": self.mix.settings(),
             "seed": self.seed,
-            "camera": self.camera,
             "colour": self.colour,
-            "size": [info.width, info.height],
+            "size": self.size,
             "device": self.device.partition(":")[0],  # without the index, because all GPUs render equal images
             "life": None if self.snapshot_source is None else self.snapshot_source.settings(),
             "sensors": {m.name: {"kind": m.kind} | msgspec.to_builtins(m) for m in self.sensors} or None,
             "negatives": self.negatives,
             "semantic": self.semantic,
             "classes": dict(enumerate(formats.SEMANTIC_CLASSES)) if self.semantic else None,
+            "sequence": self.sequence,
         }
 
-    def vineyard(self, number: int) -> Scene:
-        """Returns the scene of vineyard ``number``: with its own seed and leaves, and one row of each grape variety in
-        random order."""
-        rng = np.random.default_rng([self.seed, 1, number])
-        names = [VARIETIES[k].name for k in rng.permutation(len(VARIETIES))]
-        season = Season(leafiness=round(rng.uniform(0.5, 1.0), 3), yellow=round(rng.uniform(0.0, 0.5), 3))
-        fruit = msgspec.structs.replace(self.scene.fruit, varieties=tuple(names))
-        return msgspec.structs.replace(self.scene, seed=int(rng.integers(1 << 31)), season=season, fruit=fruit)
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Shot:
+    """What one image shows: a state of the vineyard, and a camera."""
+
+    image: int
+    snapshot: Snapshot
+    activity: dict[str, Any]
+    """Record of actors and wind."""
+    spec: CameraSpec
+    seen: PixelBuffers
+    record: dict[str, Any]
+    """Entries of the image's record that tell what was drawn."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Files:
+    """The files of one image, encoded, and its record."""
+
+    image: int
+    seen: PixelBuffers
+    files: dict[str, bytes]
+    """Content by path relative to the data set's folder."""
+    record: dict[str, Any]
+
+    def add(self, kind: str, data: bytes) -> None:
+        self.files[_file_of(kind, self.image)] = data
+
+    def write(self, folder: pathlib.Path) -> int:
+        """Write all files into ``folder``, the record last. Returns the image's index."""
+        self.record["files"] = {name: len(data) for name, data in self.files.items()}
+        self.add("records", formats.json_text(self.record).encode())
+        for name in self.files:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        write_files({folder / name: [data] for name, data in self.files.items()})
+        return self.image
 
 
 class VineyardRenderer:
@@ -182,7 +211,9 @@ class VineyardRenderer:
 
     def __init__(self, plan: DatasetPlan, number: int) -> None:
         self.plan = plan
-        self.scene = plan.vineyard(number)
+        self.number = number
+        self.scene, self.drawn = plan.mix.vineyard(np.random.default_rng([plan.seed, 1, number]))
+        self.bearing = draw_number(np.random.default_rng([plan.seed, 8, number]), plan.mix.table.sun.bearing)
         self.model = generate_uncached(self.scene)
         if not len(self.model.bunch_body):
             raise DatasetError(f"scene {self.scene.name!r} bears no bunch to look at; raise fruit.bunches")
@@ -191,23 +222,124 @@ class VineyardRenderer:
         self.primitives = Primitives(self.model, ripeness=self.ripeness, device=plan.device)
         self.primitives.update(self.rest)
         self.caster = RayCaster(self.primitives)
-        self.spec = CameraSpec.load(plan.camera).coloured(plan.colour)
-        self.info = resized_intrinsics(self.spec, plan.size)
 
-    def write_image(self, image: int, folder: pathlib.Path) -> None:
-        """Render image ``image`` and write all its files into ``folder``, the record last."""
+    def write_images(self, images: list[int], folder: pathlib.Path) -> Iterator[int]:
+        """Render ``images`` of this vineyard, which rise, and write all their files into ``folder``. Yields the index
+        of each image when it is complete."""
+
+    def write_images(self, images: list[int], folder: pathlib.Path) -> Iterator[int]:
+        """Render ``images`` of this vineyard, which rise, and write all their files into ``folder``. Yields the index
+        of each image when it is complete."""
+        if self.plan.sequence:
+            yield from self._write_sequence(images, folder)
+            return
+        for image in images:
+            yield self._render(self._random_shot(image)).write(folder)
+
+    def _write_sequence(self, images: list[int], folder: pathlib.Path) -> Iterator[int]:
+        """Render those frames of the vineyard's sequence that are among ``images``; see :meth:`write_images`.
+
+        Each state depends on the state before, so the states before the first image are computed, too. An image waits
+        for the next state, to which its optical flow leads; the last frame of a sequence has no flow.
+        """
+        waiting: _Files | None = None
+        last = images[-1] % self.plan.sequence
+        for frame, shot in enumerate(self._frames()):
+            if waiting is not None:
+                flow, shown = ground_truth.optical_flow(waiting.seen, shot.seen)
+                waiting.add("flow", formats.encode_flow(flow))
+                waiting.add("flow_seen", picture.encode_png(np.where(shown, 255, 0).astype(np.uint8)))
+                yield waiting.write(folder)
+                waiting = None
+            if frame > last:
+                return
+            if shot.image in images:
+                waiting = self._render(shot)
+                if frame == self.plan.sequence - 1:
+                    yield waiting.write(folder)
+                    return
+
+    def _frames(self) -> Iterator[_Shot]:
+        """Yield the shots of the vineyard's sequence; the primitives are posed to the state of each."""
+        plan = self.plan
+        rng = np.random.default_rng([plan.seed, 2, self.number])
+        drive = Drive.random(rng, plan.mix.table.sequence, plan.sequence, self.scene.physics.dt)
+        states: Iterator[Scenery] = itertools.repeat((self.rest, None, {}))
+        if plan.snapshot_source is not None:
+            life = np.random.default_rng([plan.seed, 5, self.number])
+            states = plan.snapshot_source.frames(self.model, life, self.scene.physics, drive.period)
+        shot: _Shot | None = None
+        start = np.zeros(7)
+        for frame in range(plan.sequence):
+            image = self.number * plan.sequence + frame
+            snapshot, near, activity = next(states)
+            self.primitives.update(snapshot, np.arange(len(self.model.tree_first)))
+            if shot is None:
+                shot = self._draw_shot(rng, image, (snapshot, near, activity), drive=drive)
+                start = shot.seen.pose
+            else:
+                pose = drive.pose(start, frame, self.model)
+                seen = ground_truth.render_buffers(self.primitives, shot.seen.info, pose)
+                shot = dataclasses.replace(shot, image=image, snapshot=snapshot, activity=activity, seen=seen)
+            times = {"frame": frame, "time": frame * drive.period, "period": drive.period, "speed": drive.speed}
+            yield dataclasses.replace(shot, record=shot.record | {"sequence": {"number": self.number, **times}})
+
+    def _random_shot(self, image: int) -> _Shot:
+        """Returns the shot of a single picture, independently of images that were rendered before."""
         rng = np.random.default_rng([self.plan.seed, 2, image])
-        hour, sun = _random_sun(rng)
-        snapshot, near, activity = self._pose_scene(image)
-        is_negative = self.plan.is_negative(image)
+        all_trees = np.arange(len(self.model.tree_first))
+        self.primitives.update(self.rest, all_trees)
+        source = self.plan.snapshot_source
+        scenery: Scenery = (self.rest, None, {})
+        if source is not None:
+            life = np.random.default_rng([self.plan.seed, 5, image])
+            scenery = source.snapshot(self.model, life, self.scene.physics) or scenery
+        if scenery[0] is not self.rest:
+            self.primitives.update(scenery[0], all_trees)
+        return self._draw_shot(rng, image, scenery, is_negative=self.plan.is_negative(image))
+
+    def _draw_shot(
+        self,
+        rng: np.random.Generator,
+        image: int,
+        scenery: Scenery,
+        *,
+        is_negative: bool = False,
+        drive: Drive | None = None,
+    ) -> _Shot:
+        """Returns a shot with sun, camera and view drawn from the mix. The primitives must be posed to the
+        ``scenery``."""
+        snapshot, near, activity = scenery
+        table = self.plan.mix.table
+        sun = draw_sun(rng, table.sun, self.bearing)
+        entry = draw_entry(rng, table.cameras)
+        zoom = draw_number(rng, entry.zoom)
+        spec = CameraSpec.load(entry.camera).coloured(self.plan.colour)
+        info = resized_intrinsics(spec, self.plan.size or entry.size)
+        info = dataclasses.replace(info, fx=info.fx * zoom, fy=info.fy * zoom)
+        view = draw_entry(rng, table.views)
+        finder = ViewFinder(self.scene.name, self.primitives, snapshot, near, drive)
         if is_negative:
-            seen = self._choose_view_without_bunches(rng, snapshot, near)
+            seen, values = finder.without_bunches(rng, view, info)
         else:
-            seen = self._choose_view(rng, snapshot, near, [(one["x"], one["y"]) for one in activity.get("actors", [])])
-        truths = ground_truth.bunch_truths(self.primitives, snapshot, seen, self.caster)
+            places = [(one["x"], one["y"]) for one in activity.get("actors", [])]
+            seen, values = finder.of_bunch(rng, view, info, places)
+        record = {
+            "negative": is_negative,
+            "sun": {**sun, "bearing": self.bearing},
+            "view": {"name": view.name, "camera": entry.camera, "zoom": zoom, **values},
+        }
+        return _Shot(image, snapshot, activity, spec, seen, record)
+
+    def _render(self, shot: _Shot) -> _Files:
+        """Render a shot, to whose state the primitives are posed."""
+        image = shot.image
+        seen = shot.seen
+        sun = tuple(shot.record["sun"]["direction"])
+        truths = ground_truth.bunch_truths(self.primitives, shot.snapshot, seen, self.caster)
         camera = Camera(
-            self.spec,
-            self.info,
+            shot.spec,
+            seen.info,
             "camera",
             sun,
             quality="still",
@@ -218,24 +350,23 @@ class VineyardRenderer:
         )
         frame = camera.render(self.primitives, seen.pose)
         assert frame.exact_depth is not None
-        bunches = formats.bunch_records(truths, self.info, self.ripeness.bunch)
-        activity["actors"] = formats.actor_records(activity.get("actors", []), seen.labels)
         record = {
             "image": image,
             "file": _file_of("images", image),
-            "split": split_of(image),
-            "negative": is_negative,
+            "split": split_of(image, self.plan.images_per_vineyard),
             "scene": {
                 "name": self.scene.name,
                 "seed": self.scene.seed,
                 "digest": self.model.digest(),
                 "leafiness": self.scene.season.leafiness,
                 "yellow": self.scene.season.yellow,
+                "drawn": self.drawn,
             },
-            "sun": {"hour": hour, "direction": list(sun)},
-            **activity,
-            "camera": formats.camera_record(self.spec.model, self.info, seen.pose),
-            "bunches": bunches,
+            **shot.record,
+            **shot.activity,
+            "actors": formats.actor_records(shot.activity.get("actors", []), seen.labels),
+            "camera": formats.camera_record(shot.spec.model, seen.info, seen.pose),
+            "bunches": formats.bunch_records(truths, seen.info, self.ripeness.bunch),
         }
         pixels = {
             "images": frame.rgb,
@@ -248,134 +379,13 @@ class VineyardRenderer:
             pixels["semantic"] = formats.encode_classes(seen)
         setting = SensorSetting(sun, self.plan.seed, image, self.plan.device, threads=1)
         for mount in self.plan.sensors:
-            kept = export_frame(mount, self.primitives, snapshot, seen.pose, setting)
+            kept = export_frame(mount, self.primitives, shot.snapshot, seen.pose, setting)
             pixels |= {f"{mount.name}/{name}": values for name, values in kept.images.items()}
             record.setdefault("sensors", {})[mount.name] = kept.record
-        files = {_file_of(kind, image): picture.encode_png(values) for kind, values in pixels.items()}
-        record["files"] = {name: len(data) for name, data in files.items()}
-        files[_file_of("records", image)] = formats.json_text(record).encode()
-        for kind in pixels:
-            (folder / kind).mkdir(parents=True, exist_ok=True)
-        write_files({folder / name: [data] for name, data in files.items()})
-
-    def _pose_scene(self, image: int) -> tuple[Snapshot, np.ndarray | None, dict[str, Any]]:
-        """Move all primitives to their poses in one image, independently of images that were rendered before.
-
-        Returns the snapshot, the point [2] m of the ground near which to look (None: anywhere), and the scene's record.
-        """
-        all_trees = np.arange(len(self.model.tree_first))
-        self.primitives.update(self.rest, all_trees)
-        source = self.plan.snapshot_source
-        activity = source.snapshot(self.model, np.random.default_rng([self.plan.seed, 5, image])) if source else None
-        if activity is None:
-            return self.rest, None, {}
-        self.primitives.update(activity[0], all_trees)
-        return activity
-
-    def _choose_view(
-        self, rng: np.random.Generator, snapshot: Snapshot, near: np.ndarray | None, actors: list[tuple[float, float]]
-    ) -> ground_truth.PixelBuffers:
-        """Returns the view of a random hanging bunch from a free place near it, in which the bunch is visible.
-
-        ``near``: point [2] m of the ground near which the bunch hangs; ``actors``: positions [m], one of which is in
-        view too, unless too many tries fail.
-        """
-        hanging = self._hanging_bunches(snapshot, near)
-        for attempt in range(_MAX_TRIES):
-            bunch = int(hanging[rng.integers(len(hanging))])
-            middle = self._middle_of_bunch(snapshot, bunch)
-            height = rng.uniform(*CAMERA_HEIGHT)
-            away = rng.uniform(*BUNCH_DISTANCE)
-            around = rng.uniform(0.0, 2.0 * np.pi)
-            if actors and attempt < _TRIES_WITH_ACTORS:  # look from the side opposite to an actor
-                behind = np.array(actors[rng.integers(len(actors))]) - middle[:2]
-                around = np.arctan2(-behind[1], -behind[0]) + rng.normal(0.0, 0.3)
-            height += float(ground_height(self.model.terrain, *middle[:2]))
-            rise = height - middle[2]
-            level = np.sqrt(max(away**2 - rise**2, rise**2))  # never steeper than 45 degrees
-            eye = np.array([*(middle[:2] + level * np.array([np.cos(around), np.sin(around)])), height])
-            aim = middle + rng.normal(0.0, 0.12, 3) * min(away, 1.0)
-            roll = frames.exp(np.array([0.0, 0.0, rng.normal(0.0, 0.03)]))
-            seen = self._look(eye, aim, roll)
-            if seen is None:
-                continue
-            shown = (seen.labels == label(Organ.BUNCH, bunch)).sum()
-            if (
-                actors
-                and attempt < _TRIES_WITH_ACTORS
-                and (seen.labels >= label(Organ.BOX, 0)).mean() < MIN_ACTOR_SHARE
-            ):
-                continue
-            if shown >= formats.MIN_ANNOTATED_PIXELS:
-                return seen
-        raise DatasetError(f"scene {self.scene.name!r} has no open place near its bunches, in {_MAX_TRIES} tries")
-
-    def _choose_view_without_bunches(
-        self, rng: np.random.Generator, snapshot: Snapshot, near: np.ndarray | None
-    ) -> ground_truth.PixelBuffers:
-        """Returns a view from a free place near a random hanging bunch, in a direction in which a plant is visible, but
-        no bunch.
-
-        ``near``: point [2] m of the ground near which the bunch hangs.
-        """
-        hanging = self._hanging_bunches(snapshot, near)
-        for attempt in range(_TRIES_WITHOUT_BUNCHES):
-            middle = self._middle_of_bunch(snapshot, int(hanging[rng.integers(len(hanging))]))
-            bearing, heading = rng.uniform(0.0, 2.0 * np.pi, 2)
-            away = rng.uniform(*BUNCH_DISTANCE)
-            eye = np.array([*(middle[:2] + away * np.array([np.cos(bearing), np.sin(bearing)])), 0.0])
-            eye[2] = rng.uniform(*CAMERA_HEIGHT)
-            # Bunches hang at the height of the camera. So later tries look farther down, at trunks and the ground.
-            pitch = rng.uniform(-0.3, 0.3) - 0.9 * min(attempt / _TRIES_UNTIL_DOWN, 1.0)
-            level = np.array([np.cos(heading), np.sin(heading), 0.0])
-            aim = eye + np.cos(pitch) * level + [0.0, 0.0, np.sin(pitch)]
-            seen = self._look(eye, aim, frames.exp(np.array([0.0, 0.0, rng.normal(0.0, 0.03)])))
-            if seen is None:
-                continue
-            organs = seen.labels // LABEL_STRIDE
-            is_plant = (organs >= Organ.TRUNK) & (organs <= Organ.LEAF)
-            if not (organs == Organ.BUNCH).any() and is_plant.mean() >= MIN_PLANT_SHARE:
-                return seen
-        raise DatasetError(
-            f"scene {self.scene.name!r} has no view of a plant without bunches, in {_TRIES_WITHOUT_BUNCHES} tries; "
-            "lower fruit.bunches, or give --negatives 0"
-        )
-
-    def _hanging_bunches(self, snapshot: Snapshot, near: np.ndarray | None) -> np.ndarray:
-        """Returns the indices of the hanging bunches; if possible only of those around the point ``near`` [2] m of the
-        ground."""
-        hanging = np.flatnonzero(snapshot.bunch_attached)
-        if near is not None:
-            away = np.linalg.norm(snapshot.body_q[self.model.bunch_body[hanging], :2] - near, axis=1)
-            hanging = hanging[away < MAX_ACTOR_DISTANCE] if (away < MAX_ACTOR_DISTANCE).any() else hanging
-        if not len(hanging):
-            raise DatasetError(f"scene {self.scene.name!r} bears too few bunches; raise fruit.bunches")
-        return hanging
-
-    def _middle_of_bunch(self, snapshot: Snapshot, bunch: int) -> np.ndarray:
-        """Returns the middle [3] m of a bunch's rachis."""
-        pose = snapshot.body_q[self.model.bunch_body[bunch]].astype(float)
-        return pose[:3] + frames.rotate(pose[3:], np.array([0.5 * self.model.bunch_length[bunch], 0.0, 0.0]))
-
-    def _look(self, eye: np.ndarray, aim: np.ndarray, roll: np.ndarray) -> ground_truth.PixelBuffers | None:
-        """Returns the view from ``eye`` [3] m to ``aim`` [3] m, turned by the quaternion ``roll`` [4]; None if the
-        place is not free, or something is too near."""
-        if np.linalg.norm(aim - eye) < 0.1 or enclosing_primitive(self.primitives, eye) >= 0:
-            return None
-        optical = picture.look_at(eye, aim)
-        optical[3:] = frames.multiply(optical[3:], roll)
-        seen = ground_truth.render_buffers(self.primitives, self.info, optical)
-        return seen if (seen.depth < MIN_CLEARANCE).mean() < 0.02 else None
-
-
-def _random_sun(rng: np.random.Generator) -> tuple[float, tuple[float, float, float]]:
-    """Returns a random solar time [h] on a day from August to October, and the unit vector towards the sun, which is at
-    least 6 degrees high."""
-    declination = np.radians(rng.uniform(-8.0, 16.0))
-    lowest = np.sin(np.radians(6.0)) - np.sin(LATITUDE) * np.sin(declination)
-    half_day = float(np.degrees(np.arccos(lowest / (np.cos(LATITUDE) * np.cos(declination))))) / 15.0
-    hour = 12.0 + half_day * float(rng.uniform(-1.0, 1.0))
-    return hour, sun_direction(hour, float(declination), float(LATITUDE))
+        files = _Files(image, seen, {}, record)
+        for kind, values in pixels.items():
+            files.add(kind, picture.encode_png(values))
+        return files
 
 
 # ---- files -----------------------------------------------------------------------------------------------------------
@@ -427,7 +437,7 @@ def _check_same_settings(file: pathlib.Path, wanted: dict[str, Any]) -> None:
     wanted = json.loads(json.dumps(wanted))
     for name, value in wanted.items():
         if there.get(name) != value:
-            was, asked = ("another one", "this one") if name == "scene" else (there.get(name), value)
+            was, asked = ("another one", "this one") if name == "mix" else (there.get(name), value)
             raise DatasetError(
                 f"{folder} was begun with {name} {was}, not {asked}; go on as it was begun, or give another folder"
             )
@@ -468,23 +478,23 @@ def render_images(plan: DatasetPlan, folder: pathlib.Path, images: Iterable[int]
 
     Raises :class:`WriteError` if an image cannot be written.
     """
-    number = -1
-    vineyard = None
-    for image in images:
-        if vineyard is None or image // IMAGES_PER_VINEYARD != number:
-            number = image // IMAGES_PER_VINEYARD
-            vineyard = VineyardRenderer(plan, number)
+    for number, group in itertools.groupby(images, lambda image: image // plan.images_per_vineyard):
+        of_vineyard = list(group)
+        done = number * plan.images_per_vineyard
+        vineyard = VineyardRenderer(plan, number)
         try:
-            vineyard.write_image(image, folder)
+            for image in vineyard.write_images(of_vineyard, folder):
+                done = image + 1
+                yield image
         except OSError as bad:
-            raise _not_written(f"image {image}", folder, bad) from None
-        yield image
+            left = next((image for image in of_vineyard if image >= done), done)
+            raise _not_written(f"image {left}", folder, bad) from None
 
 
 def finish(folder: pathlib.Path, images: int, segmentation: str = "polygons", yolo: str = "detect") -> pathlib.Path:
     """Write the files that trainers read, from the records of the first ``images`` images: ``annotations.json`` (COCO),
-    and for YOLO the folder ``labels``, ``data.yaml`` and the lists of images that it names, one for each split that has
-    images.
+    ``images/metadata.jsonl`` (Hugging Face), and for YOLO the folder ``labels``, ``data.yaml`` and the lists of images
+    that it names, one for each split that has images.
 
     Args:
         folder: folder of the data set.
@@ -504,13 +514,15 @@ def finish(folder: pathlib.Path, images: int, segmentation: str = "polygons", yo
         yield formats.yolo_labels(one["bunches"], one["camera"]["width"], one["camera"]["height"], yolo).encode()
 
     target = folder / "annotations.json"
-    seed = json.loads((folder / "dataset.json").read_text(encoding="utf-8"))["seed"]
-    coco = formats.coco_json(lambda: map(record, range(images)), seed, segmentation)
+    settings = json.loads((folder / "dataset.json").read_text(encoding="utf-8"))
+    each = settings["sequence"] or IMAGES_PER_VINEYARD
+    coco = formats.coco_json(lambda: map(record, range(images)), settings["seed"], segmentation)
     files: dict[pathlib.Path, Iterable[bytes]] = {target: map(str.encode, coco)}
     files |= {folder / _file_of("labels", number): labels(number) for number in range(images)}
-    some = [split for split in SPLITS if split_needs(split) <= images]
+    files[folder / "images" / "metadata.jsonl"] = (formats.metadata_line(record(n)).encode() for n in range(images))
+    some = [split for split in SPLITS if split_needs(split, each) <= images]
     for split in some:  # `./` is relative to the list
-        names = [f"./{_file_of('images', n)}\n" for n in range(images) if split_of(n) == split]
+        names = [f"./{_file_of('images', n)}\n" for n in range(images) if split_of(n, each) == split]
         files[folder / f"{split}.txt"] = map(str.encode, names)
     files[folder / "data.yaml"] = [formats.yolo_settings(some, yolo).encode()]
     try:
