@@ -226,10 +226,6 @@ class VineyardRenderer:
     def write_images(self, images: list[int], folder: pathlib.Path) -> Iterator[int]:
         """Render ``images`` of this vineyard, which rise, and write all their files into ``folder``. Yields the index
         of each image when it is complete."""
-
-    def write_images(self, images: list[int], folder: pathlib.Path) -> Iterator[int]:
-        """Render ``images`` of this vineyard, which rise, and write all their files into ``folder``. Yields the index
-        of each image when it is complete."""
         if self.plan.sequence:
             yield from self._write_sequence(images, folder)
             return

@@ -142,9 +142,8 @@ def _chains(
     a, b = points[:, :-1].reshape(-1, 3), points[:, 1:].reshape(-1, 3)
     step = np.linalg.norm(points[:, 1:] - points[:, :-1], axis=2)
 
-    def each(values: int | np.ndarray | tuple[float, float, float]) -> np.ndarray:
-        values = np.asarray(values)
-        return np.repeat(values, pieces, 0) if values.ndim and len(values) == count and values.shape != (3,) else values
+    def each(values: int | np.ndarray) -> np.ndarray:
+        return np.repeat(np.broadcast_to(values, count), pieces)
 
     tint = np.broadcast_to(tint, (count, 3))
     along = (np.cumsum(step, 1) - step).ravel()
