@@ -143,7 +143,8 @@ def _add_spur(
     out = frames.normalize(rise)
     head = foot + rise * g.uniform(0.55, 0.75)
     wide = age * g.uniform(0.016, 0.026) + (1.0 - age) * 0.007
-    pieces.add(foot + out * 0.2 * thick, head, min(0.92 * thick, wide + MAX_STEP), wide, Organ.ARM, index)
+    root = float(np.clip(0.92 * thick, wide - MAX_STEP, wide + MAX_STEP))
+    pieces.add(foot + out * 0.2 * thick, head, root, wide, Organ.ARM, index)
     for base in shoots:
         thin = age * g.uniform(0.0065, 0.0085) + (1.0 - age) * 0.005
         pieces.add(head, base, min(0.62 * wide, thin + MAX_STEP), thin, Organ.ARM, index)
