@@ -57,7 +57,8 @@ def seat_on_spurs(scene: Scene, structure: FixedStructure, each: int) -> SpurSea
             across = frames.cross(np.array([0.0, 0.0, 1.0]), along)
             at = 0.15 + 0.83 * (np.arange(heads) + 0.25 + 0.5 * g.random(heads)) / heads
             radius = np.interp(at * (points - 1), np.arange(points), structure.arm_radius[vine, arm])
-            high = radius * 0.8 + age * (_SPUR_HEIGHT[0] + (_SPUR_HEIGHT[1] - _SPUR_HEIGHT[0]) * g.random(heads) ** 1.6)
+            tall = g.random(heads)
+            high = radius * 0.8 + age * (_SPUR_HEIGHT[0] + (_SPUR_HEIGHT[1] - _SPUR_HEIGHT[0]) * tall * np.sqrt(tall))
             lean = 0.35 * g.normal(size=heads)
             if not upright:  # below a net, spurs grow sideways, to alternating sides
                 lean = np.where(np.arange(heads) % 2, 1.0, -1.0) * (1.2 + 0.5 * g.random(heads))
@@ -137,13 +138,14 @@ def _add_spur(
     foot, thick = axis[nearest], float(radius[nearest])
     # the foot of the spur is straight below the shoots, between the points of the axis
     way = axis[min(nearest + 1, len(axis) - 1)] - axis[max(nearest - 1, 0)]
-    way = way / np.linalg.norm(way)
-    foot = foot + way * np.clip((middle - foot) @ way, -0.03, 0.03)
+    way = frames.normalize(way)
+    foot = foot + way * np.clip(((middle - foot) * way).sum(), -0.03, 0.03)
     rise = middle - foot
     out = frames.normalize(rise)
     head = foot + rise * g.uniform(0.55, 0.75)
     wide = age * g.uniform(0.016, 0.026) + (1.0 - age) * 0.007
-    pieces.add(foot + out * 0.2 * thick, head, min(0.92 * thick, wide + MAX_STEP), wide, Organ.ARM, index)
+    root = float(np.clip(0.92 * thick, wide - MAX_STEP, wide + MAX_STEP))
+    pieces.add(foot + out * 0.2 * thick, head, root, wide, Organ.ARM, index)
     for base in shoots:
         thin = age * g.uniform(0.0065, 0.0085) + (1.0 - age) * 0.005
         pieces.add(head, base, min(0.62 * wide, thin + MAX_STEP), thin, Organ.ARM, index)
@@ -180,7 +182,7 @@ def _add_lumps(
         thick = float(radius[k] * (1.0 - share) + radius[k + 1] * share)
         along = frames.normalize(axis[k + 1] - axis[k])
         side = random_directions(g, 1)[0]
-        side = frames.normalize(side - along * (side @ along))
+        side = frames.normalize(side - along * (side * along).sum())
         if number < burls:
             size = age * thick * g.uniform(0.45, 0.75)
             root = place + side * (thick - 0.62 * size)
