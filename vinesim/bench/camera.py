@@ -156,6 +156,7 @@ def live_camera() -> Iterator[Measurement]:
     info = spec.info("optical")
     pose = look_at(np.array([-0.6, 1.0, 1.45]), np.array([8.0, 1.35, 1.45]))
     one, all_cores = (Camera(spec, info, quality="fast", threads=threads) for threads in (1, None))
+    plain = Camera(spec.coloured("exact"), info, quality="fast", threads=1)
     wanted = CameraOutput.RGB | CameraOutput.DEPTH
     swaying = np.arange(0, len(model.body_mass) // 20)
     snapshots = [
@@ -190,6 +191,7 @@ def live_camera() -> Iterator[Measurement]:
             20.0,
         ),
         ("whole frame, nothing moves", lambda: one.render(primitives, pose, outputs=wanted), 90.0),
+        ("the same, exact colours", lambda: plain.render(primitives, pose, outputs=wanted), 90.0),
         ("shadow maps, one vine in twenty moved", part_of_shadows, 15.0),
         ("shadow maps, both drawn anew", shadows, 45.0),
     ]

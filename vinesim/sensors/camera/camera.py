@@ -225,13 +225,15 @@ class Camera:
         if samples > 1:
             self._supersampled = CameraRasterizer(width * samples, height * samples, self.device, workers)
         colour = self.spec.colour
-        has_flash = colour is not None and colour.flash is not None and not quality.is_live
+        flash = 0.0  # the kernels of live light have none
+        if colour is not None and colour.flash is not None and not quality.is_live:
+            flash = colour.flash.value
         self._sunlight = Sunlight(
             self.sun,
             taps=quality.taps,
             period=period,
             fine=quality.shadow_texel_divisor,
-            flash=colour.flash.value if has_flash else 0.0,
+            flash=flash,
             device=self.device,
             workers=workers,
         )

@@ -233,7 +233,9 @@ def compressed(rgb: np.ndarray, subsampling: tuple[int, ...], quality: int | Non
     )
     if not done:
         raise RuntimeError(f"OpenCV does not encode a picture of {bgr.shape[1]}x{bgr.shape[0]} px")
-    return cv2.cvtColor(cv2.imdecode(data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    decoded = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    assert decoded is not None, "OpenCV reads what it has written"
+    return cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
 
 
 def _subsampled(rgb: np.ndarray, across: int, down: int) -> np.ndarray:

@@ -346,11 +346,11 @@ class Sunlight:
         self._direction = direction
         self._palette = palette
         light = self.light
+        light.flash = self._flash if direction[2] < 0.0 else 0.0
         now = OutdoorLight.of(direction[2], palette)
         if light.flash > 0.0:
             now = now.dimmed(10.0 ** (direction[2] / _TWILIGHT))
         light.sun = _vector(direction)
-        light.flash = self._flash if direction[2] < 0.0 else 0.0
         light.sun_colour = _vector(now.sun)
         light.sky_colour = _vector(now.sky)
         light.haze_colour = _vector(now.haze)
