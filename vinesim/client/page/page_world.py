@@ -241,12 +241,8 @@ class PageWorld:
         scene = self._client.scene
         outline, hull = textures.leaf_outlines()
         outline = np.round(_halved(outline[..., None])[..., 0]).astype(np.int8)
-        leaf = _halved(textures.leaf_texture()) * [1.0, 0.5, 0.5, 1.0] + [
-            0.0,
-            0.5,
-            0.5,
-            0.0,
-        ]  # slopes are signed numbers
+        leaf = _halved(textures.leaf_texture())
+        leaf = leaf * [1.0, 0.5, 0.5, 1.0] + [0.0, 0.5, 0.5, 0.0]  # slopes are signed numbers
         ground = primitives.materials
         model = self._client.model
         sun = scene.sun.direction(0.0)
