@@ -242,7 +242,9 @@ class PageWorld:
         primitives = self._lay_out()
         scene = self._client.scene
         outline, hull = textures.leaf_outlines()
-        leaf = textures.leaf_texture() * [1.0, 0.5, 0.5, 1.0] + [0.0, 0.5, 0.5, 0.0]  # slopes are signed numbers
+        outline = np.round(_halved(outline[..., None])[..., 0]).astype(np.int8)
+        leaf = _halved(textures.leaf_texture())
+        leaf = leaf * [1.0, 0.5, 0.5, 1.0] + [0.0, 0.5, 0.5, 0.0]  # slopes are signed numbers
         ground = primitives.materials
         model = self._client.model
         sun = scene.sun.direction(0.0)
@@ -477,6 +479,12 @@ def _light(height: float, palette: Palette) -> dict[str, Any]:
     light = OutdoorLight.of(height, palette)
     colours = {name: getattr(light, name).tolist() for name in ("sun", "sky", "haze", "ground", "canopy", "balance")}
     return colours | {"dim": light.dim, "exposure": AMONG_VINES * usual_exposure(light.brightness)}
+
+
+def _halved(tables: np.ndarray) -> np.ndarray:
+    """Returns textures [k, side, side, channel] with half the resolution: a page must load fast."""
+    k, side, _, channels = tables.shape
+    return tables.astype(np.float32).reshape(k, side // 2, 2, side // 2, 2, channels).mean((2, 4))
 
 
 def _bytes(values: np.ndarray) -> np.ndarray:

@@ -151,8 +151,8 @@ export class World {
     }
     const outlines = new THREE.DataArrayTexture(
       Uint8Array.from(arrays.outline, (x) => x + 128),
-      256,
-      256,
+      128,
+      128,
       outlineCount,
     );
     outlines.format = THREE.RedFormat;
@@ -166,7 +166,7 @@ export class World {
     this.sunCamera = new THREE.OrthographicCamera(-SUN_REACH, SUN_REACH, SUN_REACH, -SUN_REACH, SUN_NEAR, SUN_FAR);
     const noises = smoothTable(new THREE.DataTexture(arrays.noise, 256, 256, THREE.RGBAFormat));
     noises.wrapS = noises.wrapT = THREE.RepeatWrapping;
-    const leaves = smoothTable(new THREE.DataArrayTexture(arrays.leaf, 128, 128, outlineCount));
+    const leaves = smoothTable(new THREE.DataArrayTexture(arrays.leaf, 64, 64, outlineCount));
     const common = {
       eye: { value: this.eye },
       sun: { value: new THREE.Vector3(...header.sun) },
