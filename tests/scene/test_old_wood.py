@@ -29,17 +29,15 @@ def old():
 def test_a_scene_without_clutter_is_the_same_with_an_empty_table(name) -> None:
     scene = load_scene(name)
     assert generate_uncached(scene).digest() == generate_uncached(_with(scene, Clutter())).digest()
-    assert generate_uncached(_with(scene, Clutter())).clutter is None
 
 
 def _with(scene: Scene, clutter: Clutter) -> Scene:
     return msgspec.structs.replace(scene, clutter=clutter)
 
 
-def test_clutter_that_cannot_be_touched_changes_the_digest_but_no_array() -> None:
+def test_clutter_that_cannot_be_touched_changes_no_array() -> None:
     plain = generate_uncached(_scene())
     strewn = generate_uncached(_scene(straw=0.5, tendrils=0.3, hose=1.0, distant_rows=1.0))
-    assert strewn.digest() != plain.digest()
     for name in plain.array_fields():
         np.testing.assert_array_equal(getattr(plain, name), getattr(strewn, name), err_msg=name)
 

@@ -19,16 +19,16 @@ PARTS = ("leaf", "wood", "ground", "sky")
 
 def test_a_scene_that_names_no_palette_has_the_default_whatever_its_seed():
     for seed in (1, 2):
-        assert generate(load_scene("vsp", seed=seed)).palette == DEFAULT
+        assert generate(load_scene("vsp", seed=seed)).look.palette == DEFAULT
     assert draw(palette.DEFAULT_NAME, 7) == DEFAULT
 
 
 def test_the_palette_changes_neither_plants_nor_their_digest():
     scene = load_scene("vsp")
     plain, red = generate(scene), generate(with_palette(scene, "red-earth"))
-    assert red.palette.name == "red-earth"
+    assert red.look.palette.name == "red-earth"
     assert red.digest() == plain.digest()
-    assert red.copy().palette == red.palette
+    assert red.copy().look.palette == red.look.palette
 
 
 @pytest.mark.parametrize("name", NAMED)

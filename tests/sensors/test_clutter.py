@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import msgspec
 import mujoco
 import numpy as np
@@ -136,7 +138,7 @@ def test_picture_and_contact_agree_on_arms_and_spur_heads(monkeypatch) -> None:
     monkeypatch.setattr(clutter, "bark_batch", lambda *_: None)
     monkeypatch.setattr(clutter, "cut_batch", lambda *_: None)
     model = generate_uncached(_scene(Clutter(old_wood=1.0), bare=True))
-    model.clutter_seed = 77  # primitives that no disk cache has
+    model.look = dataclasses.replace(model.look, seed=77)  # primitives that no disk cache has
     primitives = Primitives(model, grass=0.0)
     world = build_static_world(model, PhysicsParameters()).compile()
     data = mujoco.MjData(world)
@@ -168,7 +170,7 @@ def test_picture_and_contact_agree_on_arms_and_spur_heads(monkeypatch) -> None:
 def test_posts_are_where_they_are_touched() -> None:
     for kind, most in (("wood", 1e-6), ("concrete", 0.014), ("steel", 0.013)):
         model = generate_uncached(_scene(Clutter(posts=kind)))
-        batches = clutter.post_batches(model, model.clutter, 0)
+        batches = clutter.post_batches(model, model.look.clutter, 0)
         pole = np.flatnonzero(model.fixed_organ == int(Organ.POLE))
         radius = float(model.fixed_radius[pole[0], 0])
         names = {int(one) for batch in batches for one in batch.label}

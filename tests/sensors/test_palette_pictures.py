@@ -8,6 +8,7 @@ import pytest
 from tests.support import sensor_scenes
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
+from vinesim.scene.look import Look
 from vinesim.scene.palette import DEFAULT, GroundColours, Palette, _sky, draw, palette_names, to_hsv
 from vinesim.scene.spec import load_scene
 from vinesim.sensors.camera.camera import Camera
@@ -42,7 +43,7 @@ def white(monkeypatch):
 
 def picture(model, palette: Palette, pose=AT_THE_ROW, quality="full", grass=0.0, exposure=0.6):
     """The picture [row, column, 3] of the model with a palette, and the organ of each pixel."""
-    model.palette = palette
+    model.look = Look(palette)
     camera = Camera(sensor_scenes.IDEAL, sensor_scenes.SMALL, sun=SUN, quality=quality, exposure=exposure)
     frame = camera.render(Primitives(model, grass=grass), pose)
     return frame.rgb, frame.labels >> 20
@@ -130,7 +131,7 @@ def test_another_palette_is_another_entry_of_the_cache(model, tmp_path, monkeypa
     monkeypatch.setenv("VINESIM_CACHE", str(tmp_path))
     tints = []
     for name in ("slate", "chalk", "slate"):
-        model.palette = draw(name, 1)
+        model.look = Look(draw(name, 1))
         tints.append(Primitives(model, grass=5.0).materials.tint.numpy())
     assert np.array_equal(tints[0], tints[2])
     assert not np.array_equal(tints[0], tints[1])
@@ -141,7 +142,7 @@ def test_a_camera_that_sees_another_palette_has_its_light(model):
     light = Sunlight(SUN)
     found = []
     for name in ("default", "chalk", "default"):
-        model.palette = draw(name, 1)
+        model.look = Look(draw(name, 1))
         light.update(Primitives(model, grass=0.0), np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]), 0.0)
         found.append(tuple(light.light.ground_colour))
     assert found[0] == found[2] != found[1]

@@ -20,25 +20,11 @@ import numpy as np
 from vinesim.core import frames
 from vinesim.core.array_fields import StructOfArrays, array
 from vinesim.scene.ids import Organ
-from vinesim.scene.palette import DEFAULT, Palette
-from vinesim.scene.spec import Clutter
+from vinesim.scene.look import Look
 from vinesim.scene.terrain import Terrain
 
 _UNIT_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 _UNIT_QUAT = (0.0, 0.0, 0.0, 1.0)
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class FruitLook:
-    """What is visible of the state of the fruit; see :class:`vinesim.scene.spec.Fruit`."""
-
-    ripeness: tuple[float, float] | None
-    """Least and greatest ripeness of a bunch; None: not given."""
-    rot: float
-    shrivelled: float
-    sunburn: float
-    seed: int
-    """Seed of the random differences between bunches and berries."""
 
 
 @dataclasses.dataclass
@@ -159,25 +145,12 @@ class Model(StructOfArrays):
 
     terrain: Terrain | None = None
     """The uneven ground; None: the plane z = 0."""
-    clutter: Clutter | None = None
-    """What is seen beside the plants; None: nothing. Old wood that can be touched is in the arrays."""
-    clutter_seed: int = 0
-    """Seed of the clutter: the scene's."""
-    fruit_look: FruitLook | None = None
-    """Visible state of the fruit; None: all fruit is ripe and sound. It is not part of the digest."""
-    palette: Palette = DEFAULT
-    """Colours for sensors. They are not part of the digest."""
+    look: Look = dataclasses.field(default_factory=Look)
+    """What sensors see and physics does not need. It is not part of the digest."""
 
     def copy(self) -> Model:
-        """Returns a deep copy of the arrays, with the same terrain, clutter, look of the fruit and palette."""
-        return dataclasses.replace(
-            super().copy(),
-            terrain=self.terrain,
-            clutter=self.clutter,
-            clutter_seed=self.clutter_seed,
-            fruit_look=self.fruit_look,
-            palette=self.palette,
-        )
+        """Returns a deep copy of the arrays, with the same terrain and look."""
+        return dataclasses.replace(super().copy(), terrain=self.terrain, look=self.look)
 
     def digest(self) -> str:
         """Returns a hash of all arrays (16 hex digits): two clients with equal digests hold the same vineyard."""
@@ -187,8 +160,6 @@ class Model(StructOfArrays):
         if self.terrain is not None:
             h.update(repr((self.terrain.origin, self.terrain.cell, self.terrain.slope)).encode())
             h.update(self.terrain.residual.tobytes())
-        if self.clutter is not None:
-            h.update(repr((self.clutter, self.clutter_seed)).encode())
         return h.hexdigest()
 
     def bodies_of(self, tree: int) -> slice:

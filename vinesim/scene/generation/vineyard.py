@@ -29,7 +29,8 @@ from vinesim.scene.generation.uneven_ground import (
     raise_ties,
 )
 from vinesim.scene.ids import Organ
-from vinesim.scene.model import FruitLook, Model
+from vinesim.scene.look import Look
+from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.plant_import.imported_plant import load_imported_plant
 from vinesim.scene.plant_import.ties import tie_to_wires
@@ -75,25 +76,13 @@ def generate(scene: Scene) -> Model:
     )
     imported = [(load_imported_plant(one.file), msgspec.structs.replace(one, file="")) for one in scene.imported]
     digest = disk_cache.source_digest(_code_digest(), msgspec.json.encode((plants, parameters, imported, ground)))
-    clutter, seed = _clutter_of(scene)
-    look = _fruit_look(scene)
-    colours = palette.resolve(scene)
     arrays = disk_cache.load_or_make("vineyard", digest, make)
-    return Model(
-        terrain=terrain, clutter=clutter, clutter_seed=seed, fruit_look=look, palette=colours, **arrays
-    ).check()
+    return Model(terrain=terrain, look=Look.of(scene), **arrays).check()
 
 
 def generate_uncached(scene: Scene) -> Model:
     """Returns the same model as :func:`generate` without using the cache. For scenes that are needed only once."""
-    model = _generate(scene, plant_parameters.load_plant(scene.plants), build_terrain(scene))
-    model.clutter, model.clutter_seed = _clutter_of(scene)
-    return model
-
-
-def _clutter_of(scene: Scene) -> tuple[Clutter | None, int]:
-    """Returns the clutter of the scene's model and its seed; None and 0 if the scene has no clutter."""
-    return (scene.clutter, scene.seed) if scene.clutter != Clutter() else (None, 0)
+    return _generate(scene, plant_parameters.load_plant(scene.plants), build_terrain(scene))
 
 
 @functools.cache
@@ -102,14 +91,6 @@ def _code_digest() -> str:
     package = pathlib.Path(builder.__file__).parent
     others = [pathlib.Path(str(module.__file__)) for module in (frames, array_fields, portable_math)]
     return disk_cache.source_digest(package, *others, repr(berries.VARIETIES))
-
-
-def _fruit_look(scene: Scene) -> FruitLook | None:
-    """Returns the visible state of the scene's fruit; None if the scene does not describe it."""
-    fruit = scene.fruit
-    if fruit.ripeness is None and not (fruit.rot or fruit.shrivelled or fruit.sunburn):
-        return None
-    return FruitLook(fruit.ripeness, fruit.rot, fruit.shrivelled, fruit.sunburn, scene.seed)
 
 
 def _generate(scene: Scene, parameters: VineParameters, terrain: Terrain | None) -> Model:
@@ -133,8 +114,7 @@ def _generate(scene: Scene, parameters: VineParameters, terrain: Terrain | None)
             half = 0.5 * box.size[0], 0.5 * box.size[1]
             model.box_pose[i] = terrain.resting_pose(box.x, box.y, box.yaw, half)
     model = builder.solve_rest_pose(model).check()
-    model.fruit_look = _fruit_look(scene)
-    model.palette = palette.resolve(scene)
+    model.look = Look.of(scene)
     variety = [v.name for v in berries.VARIETIES].index(scene.fruit.varieties[0])
     for number, one in enumerate(scene.imported):
         foot = one.z + float(ground_height(terrain, one.x, one.y))

@@ -371,7 +371,7 @@ class Sunlight:
     ) -> tuple[shadow_maps.ShadowMap, shadow_maps.ShadowMap]:
         """Compute light and shadows again where they are no longer valid at ``time`` [s], for a camera at ``eye`` [3] m
         that looks along ``forward`` [3]. Returns the fine and the coarse shadow map."""
-        self._update_light(time, primitives.model.palette)
+        self._update_light(time, primitives.model.look.palette)
         for one in (self._near, self._far):
             one.follow(primitives, eye, forward, time, self.period)
         return self._near.struct, self._far.struct

@@ -11,6 +11,7 @@ from vinesim.core import frames
 from vinesim.kernels.shading import materials
 from vinesim.scene.berries import VARIETIES, BerryLayout, Variety, lay_out_berries, segment_of
 from vinesim.scene.ids import Organ, label
+from vinesim.scene.look import FruitLook
 from vinesim.scene.model import Model
 from vinesim.sensors.primitives.plant_primitives import STEM_TINT
 from vinesim.sensors.primitives.primitive_batches import Batch, make_batch, stack_columns
@@ -55,13 +56,13 @@ class Ripeness:
     @classmethod
     def of(cls, model: Model) -> Ripeness | None:
         """Returns the state of the fruit that the model's scene describes; None if it describes none."""
-        look = model.fruit_look
-        if look is None:
+        fruit = model.look.fruit
+        if fruit == FruitLook():
             return None
-        low, high = (1.0, 1.0) if look.ripeness is None else look.ripeness
-        rng = np.random.default_rng([look.seed, 3])
+        low, high = (1.0, 1.0) if fruit.ripeness is None else fruit.ripeness
+        rng = np.random.default_rng([model.look.seed, 3])
         bunch = np.round(rng.uniform(low, high, len(model.bunch_body)), 3)
-        return cls(bunch, look.seed, look.rot, look.shrivelled, look.sunburn)
+        return cls(bunch, model.look.seed, fruit.rot, fruit.shrivelled, fruit.sunburn)
 
     @classmethod
     def for_pictures(cls, model: Model, seed: int) -> Ripeness:
@@ -71,9 +72,8 @@ class Ripeness:
         drawn = cls.random(len(model.bunch_body), seed)
         if given is None:
             return drawn
-        look = model.fruit_look
-        assert look is not None
-        return given if look.ripeness is not None else dataclasses.replace(given, bunch=drawn.bunch)
+        has_ripeness = model.look.fruit.ripeness is not None
+        return given if has_ripeness else dataclasses.replace(given, bunch=drawn.bunch)
 
     @classmethod
     def random(cls, count: int, seed: int) -> Ripeness:

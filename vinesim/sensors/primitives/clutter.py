@@ -63,9 +63,7 @@ def clutter_batches(
     ``segments``: the wires; ``static_carrier``: carrier of what never moves, which follows the carriers of the wires;
     ``low``, ``high``: [2] m corners of the area with vines.
     """
-    clutter = model.clutter
-    if clutter is None:
-        return []
+    clutter = model.look.clutter
     first_wire = static_carrier - len(segments)
     parts: list[Batch | None] = []
     if clutter.old_wood > 0.0:
@@ -94,14 +92,14 @@ def clutter_batches(
 
 def redrawn_posts(model: Model) -> np.ndarray:
     """Returns whether each fixed piece is a post that :func:`post_batches` draws [fixed] bool."""
-    if model.clutter is None or model.clutter.posts == "plain":
+    if model.look.clutter.posts == "plain":
         return np.zeros(len(model.fixed_start), bool)
     return model.fixed_organ == int(Organ.POLE)
 
 
 def with_old_bark(model: Model, material: np.ndarray, tint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns material [n] and colour [n, 3] of fixed pieces, with bark replaced by old bark if the wood is old."""
-    if model.clutter is None or model.clutter.old_wood == 0.0:
+    if model.look.clutter.old_wood == 0.0:
         return material, tint
     bark = material == int(materials.BARK)
     return np.where(bark, int(materials.OLD_BARK), material), np.where(bark[:, None], OLD_BARK_TINT, tint)
@@ -109,7 +107,7 @@ def with_old_bark(model: Model, material: np.ndarray, tint: np.ndarray) -> tuple
 
 def _generator(model: Model, kind: int) -> np.random.Generator:
     """Returns the random generator of one kind of clutter."""
-    return np.random.default_rng(np.random.SeedSequence(model.clutter_seed, spawn_key=(0, 0, 3, kind)))
+    return np.random.default_rng(np.random.SeedSequence(model.look.seed, spawn_key=(0, 0, 3, kind)))
 
 
 def _cells(position: np.ndarray) -> np.ndarray:
@@ -680,7 +678,7 @@ def post_batches(model: Model, clutter: Clutter, static_carrier: int) -> list[Ba
     pole, row = _poles(model)
     if clutter.posts == "plain" or not len(pole):
         return []
-    kind = post_kinds(clutter, model.clutter_seed, row)
+    kind = post_kinds(clutter, model.look.seed, row)
     rng = _generator(model, 11)
     tone = rng.uniform(0.8, 1.15, (len(pole), 1))
     shade = rng.integers(1 << 16, size=int(row.max()) + 1)[row]

@@ -66,19 +66,18 @@ class _Vineyard:
 def shaded_extent(model: Model, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns the corners [2] m of the ground that vines shade, with the distant ones; ``low``, ``high``: [2] m corners
     of the area with the scene's own vines."""
-    has = model.clutter is not None and model.clutter.distant_rows > 0.0
-    margin = REACH + 2.0 if has else 3.0
+    margin = REACH + 2.0 if model.look.clutter.distant_rows > 0.0 else 3.0
     return low - margin, high + margin
 
 
 def distant_batches(model: Model, static_carrier: int) -> list[Batch]:
     """Returns the primitives of distant rows and trees; none for a model without them."""
-    if model.clutter is None or model.clutter.distant_rows == 0.0 or (yard := _vineyard(model)) is None:
+    if model.look.clutter.distant_rows == 0.0 or (yard := _vineyard(model)) is None:
         return []
-    rng = np.random.default_rng(np.random.SeedSequence(model.clutter_seed, spawn_key=(0, 0, 4, 0)))
+    rng = np.random.default_rng(np.random.SeedSequence(model.look.seed, spawn_key=(0, 0, 4, 0)))
     sides = rng.permutation(4)  # low x, high x, low y, high y
     is_open = np.zeros(4, bool)
-    is_open[sides[: round(4.0 * (1.0 - model.clutter.distant_rows))]] = True
+    is_open[sides[: round(4.0 * (1.0 - model.look.clutter.distant_rows))]] = True
     place = _vines(yard, is_open)
     if len(place) > MAX_VINES:
         place = place[np.sort(rng.choice(len(place), MAX_VINES, replace=False))]

@@ -44,7 +44,7 @@ def cane_batch(model: Model) -> Batch:
     # shoots become brown from the base: they are green towards the tip, brown where the wood is thick
     green = np.clip(1.6 - model.body_radius[bodies].mean(1) / 0.0022, 0.0, 1.0) * (seed[tree] < 0.6)
     green = np.where(organ == int(Organ.PEDUNCLE), 1.0, green)[:, None]
-    wood = model.palette.wood
+    wood = model.look.palette.wood
     tint = (1.0 - green) * np.array(wood.cane) * (0.7 + 0.6 * seed[tree, None]) + green * np.array(wood.stem)
     material = np.where(green[:, 0] > 0.5, int(materials.STEM), int(materials.CANE))
     length = model.body_length[bodies]
@@ -108,7 +108,7 @@ def leaf_batches(model: Model) -> list[Batch]:
     base = model.leaf_base
     petiole_end = model.leaf_pose[:, :3]
     size = model.leaf_size * textures.leaf_scale(shape)
-    colours = model.palette.leaf
+    colours = model.look.palette.leaf
     tint = _leaf_tints(colours, model.leaf_age, rng)
     bend = np.stack([rng.normal(-0.10, 0.16, count), rng.normal(-0.16, 0.14, count), rng.uniform(0.0, 0.45, count)], 1)
     bend = np.clip(
@@ -151,7 +151,7 @@ def leaf_batches(model: Model) -> list[Batch]:
         stack_columns(axis - 0.7 * reach, 1.25 * r),
         b=stack_columns(axis + 0.4 * reach, 1.45 * r),
         material=int(materials.CANE),
-        tint=model.palette.wood.node,
+        tint=model.look.palette.wood.node,
         organ=int(Organ.CANE),
         label=label(Organ.CANE, 0) + tree,
         carrier=body,

@@ -132,7 +132,7 @@ class Primitives:
         """The uneven ground; without nodes the ground is the plane z = 0."""
         self._textures.rows = wp.vec2(*row_layout(model))
         self._textures.ground = self.ground
-        self._textures.colours = colour_struct(model.palette)
+        self._textures.colours = colour_struct(model.look.palette)
         self._textures.leaf_texture, self._textures.noise_texture, self._textures.soil_texture = (
             wp.array(table, dtype=wp.vec4, device=device)
             for table in (textures.leaf_texture(), textures.noise_texture(), textures.soil_texture())
@@ -230,7 +230,7 @@ class Primitives:
         around = [*trellis_batches(model, static), wire_batch(model, self._wires, self._bodies, len(model.tree_first))]
         if grass > 0.0:
             age = float(model.leaf_age.mean()) if len(model.leaf_age) else 0.0
-            colours = model.palette.ground
+            colours = model.look.palette.ground
             tufts = grass_batch(row_layout(model), low, high, grass, static, model.terrain, colours)
             around += [tufts, litter_batch(low, high, age, static, model.terrain, colours)]
         batches += [b for b in around if b is not None]
@@ -517,8 +517,7 @@ def _digest(model: Model, grass: float, device: str) -> str:
     shading = package / "kernels" / "shading"
     code += [shading / "materials.py", shading / "shadow_maps.py"]
     where = device.partition(":")[0]
-    looks = f"{model.palette!r} {model.fruit_look!r}"
-    return disk_cache.source_digest(*code, f"{model.digest()} {grass!r} {berries.VARIETIES!r} {looks}", where)
+    return disk_cache.source_digest(*code, f"{model.digest()} {grass!r} {berries.VARIETIES!r} {model.look!r}", where)
 
 
 def rest_snapshot(model: Model, visuals: tuple[RigidVisual, ...] = (), visual_q: np.ndarray | None = None) -> Snapshot:

@@ -94,7 +94,7 @@ def _cones(model: Model, piece: np.ndarray, begin: np.ndarray, stop: np.ndarray)
 
 def _before(model: Model) -> np.ndarray:
     """Returns the distance [fixed] m from the start of an old arm to each of its pieces; 0 for all other pieces."""
-    if model.clutter is None or model.clutter.old_wood == 0.0:
+    if model.look.clutter.old_wood == 0.0:
         return np.zeros(len(model.fixed_start))
     elastic = model.arm_is_elastic()
     length = np.where(elastic, np.linalg.norm(model.fixed_end - model.fixed_start, axis=1), 0.0)
@@ -105,7 +105,7 @@ def _before(model: Model) -> np.ndarray:
 
 def _look(model: Model, organ: Organ) -> tuple[int, tuple[float, float, float]]:
     """Returns material and colour (linear RGB) of a part of the trellis or of old wood."""
-    wood = model.palette.wood
+    wood = model.look.palette.wood
     if organ == Organ.POLE:
         return int(materials.POST), wood.post
     if organ == Organ.WIRE:
