@@ -381,11 +381,11 @@ def _mixed(a: Rgb, b: Rgb, share: float) -> Rgb:
 
 
 def _times(a: Rgb, factor: float | Rgb) -> Rgb:
-    factors = (factor,) * 3 if isinstance(factor, float) else factor
+    factors = factor if isinstance(factor, tuple) else (factor, factor, factor)
     return _rounded(x * f for x, f in zip(a, factors, strict=True))
 
 
-_WARMTH = 0.4
+_WARMTH = 0.5
 """How much yellower light through a leaf is than light from it, relative to the default palette."""
 _BOUNCE = 0.7
 """Exponent by which the light from the ground follows its reflectance: a part of the ground is in shade."""
@@ -401,13 +401,13 @@ def _leaf(drawn: dict[str, typing.Any]) -> LeafColours:
     if "grown" in drawn:
         grown = drawn["grown"]
         drawn.setdefault("young", grown)
-        drawn["pale"] = _times(_mixed(grown, drawn["young"], 0.2), 0.4)
+        drawn["pale"] = _times(_mixed(grown, drawn["young"], 0.1), 0.4)
         hue, saturation, value = to_hsv(grown)
         # light through a leaf is yellower than light from it, least for a blue green leaf
-        warmth = _WARMTH * min(max((140.0 - hue) / 50.0, 0.0), 1.0)
+        warmth = _WARMTH * min(max((140.0 - hue) / 50.0, 0.5), 1.0)
         drawn["through"] = _mixed((2.0, 2.0, 2.0), usual.through, warmth)
-        # veins are yellower and paler than the blade
-        drawn["vein"] = from_hsv(hue + 0.05 * (70.0 - hue), 0.75 * saturation, min(1.5 * value, 0.75))
+        # veins are paler than the blade
+        drawn["vein"] = from_hsv(hue, 0.75 * saturation, min(1.5 * value, 0.75))
         brighter = [min(max((new / old) ** 0.5, 0.4), 2.5) for new, old in zip(grown, usual.grown, strict=True)]
         drawn["shade"] = _times(usual.shade, _rounded(brighter))
     if "under" in drawn:
