@@ -134,7 +134,7 @@ def _stand(description: Any) -> dict[str, Any]:
     from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
     from vinesim.rigid.rigid_world import RigidWorld
-    from vinesim.robot.description.extent import bounds
+    from vinesim.robot.description.extent import bounds, link_boxes
     from vinesim.robot.drives.controlled_robot import Robot
     from vinesim.scene.builder import assemble
 
@@ -163,7 +163,7 @@ def _stand(description: Any) -> dict[str, Any]:
     }
     if not shapes:
         return seen | {"pixels": 0, "visible": False}
-    box = bounds(description, etree.fromstring(description.urdf.encode()))
+    box = bounds(link_boxes(description, etree.fromstring(description.urdf.encode())))
     assert box is not None, "a robot with shapes has bounds"
     pixels = _pixels(model, rigid, box)
     return seen | {"pixels": pixels, "visible": pixels >= LEAST_PIXELS}

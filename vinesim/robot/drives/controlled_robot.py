@@ -204,6 +204,8 @@ class Robot(RobotInstance):
         if not np.isfinite([linear, angular]).all():
             raise CommandError(f"{self.name}: base velocity ({linear}, {angular}) is not finite")
         limits = self.description.base_limits
+        if limits.kind == "free":
+            raise CommandError(f"{self.name} stands on its legs: it has no wheels to drive; command its joints")
         self._base_goal = _clamp(linear, limits.linear), _clamp(angular, limits.angular)
         self._base_time = time
 
@@ -242,6 +244,8 @@ class Robot(RobotInstance):
     def _drive_base(self, time: float) -> None:
         """Accelerate the base towards its commanded velocity, or to a stop if the last command is too old."""
         limits = self.description.base_limits
+        if limits.kind == "free":
+            return
         linear_goal, angular_goal = self._base_goal if time - self._base_time <= limits.timeout else (0.0, 0.0)
         linear, angular = self._base_velocity
         linear += _clamp(linear_goal - linear, self.rigid.dt * limits.linear_acceleration)

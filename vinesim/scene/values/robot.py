@@ -67,6 +67,8 @@ class RobotSpec:
     """Whether the robot is a copy of a robot that another client simulates. The links of a copy do not collide with
     each other and the ground: the received states already include these contacts, and the boxes that replace meshes in
     a copy would collide wrongly."""
+    has_free_base: bool = False
+    """Whether the base moves freely and the robot stands on its legs. Otherwise the base is driven, or bolted down."""
 
 
 class ControllerKind(enum.StrEnum):
@@ -234,3 +236,5 @@ class RobotSample:
     wrenches: tuple[Wrench, ...] = ()
     imus: tuple[Imu, ...] = ()
     reference: JointReference | None = None
+    odom_is_spatial: bool = False
+    """Whether odometry measures z, roll and pitch too, as exactly as x: the robot stands on legs."""
