@@ -287,6 +287,10 @@ def test_odometry_is_what_was_measured_with_its_covariances():
         found = np.reshape(part.covariance, (6, 6))
         assert np.array_equal(found[np.ix_((0, 1, 5), (0, 1, 5))], expected)
         assert found[2:5, 2:5].tolist() == np.diag([convert.UNMEASURED] * 3).tolist()
+    on_legs = convert.odometry(dataclasses.replace(sample, odom_is_spatial=True), "base_footprint", "odom")
+    for part, expected in zip((on_legs.pose, on_legs.twist), covariance, strict=True):
+        found = np.reshape(part.covariance, (6, 6))
+        assert found[2:5, 2:5].tolist() == np.diag([expected[0, 0]] * 3).tolist()
 
 
 def test_wrench_and_imu_keep_their_frames():
