@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import pathlib
+import re
 
 import mujoco
 import numpy as np
@@ -273,6 +274,11 @@ def test_what_cannot_be_is_told_in_one_line(tmp_path: pathlib.Path) -> None:
     ) as caught:
         load_description(file, base="free")
     assert "\n" not in str(caught.value)
+    airy = pathlib.Path(dog(tmp_path / "b.urdf"))
+    airy.write_text(re.sub("<collision>.*?</collision>", "", airy.read_text()))
+    assert load_description(airy).base_limits.kind == "planar"
+    with pytest.raises(DescriptionError, match="nothing of it collides"):
+        load_description(airy, base="free")
     with pytest.raises(DescriptionError, match="the base is 'loose'; give auto, planar, free, fixed"):
         load_description(file, base="loose")
 

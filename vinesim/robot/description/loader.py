@@ -181,7 +181,7 @@ class _Loading:
         assembly = _Assembly(file, toml, sidecar, sensors, groups, self.home, is_remote=self.is_remote)
         made = assembly.description(root)
         boxes = {} if self.is_remote else link_boxes(made[0], root)
-        standing = feet(made[0], boxes)
+        standing = feet(made[0], boxes) if root.find("link/collision") is not None else {}
         kind = self._base_kind(sidecar.base.kind if kind == "auto" else kind, made[0].base, standing, has_wheels)
         if root_joint and kind != "free":
             notes.append(f"its base moves on a {root_joint} joint: {'bolted down' if kind == 'fixed' else 'driven'}")
@@ -196,7 +196,7 @@ class _Loading:
                 assumed.append(warning)
             lift = -float(box[0, 2]) if base not in (MOUNT, "base_footprint") and box[0, 2] < -LEAST_LIFT else 0.0
             if kind == "free":
-                lift = -(lowest_point(made[0].to_spec("robot")) or 0.0)
+                lift = self._height_on_feet(made[0])
             if lift and warning is None:
                 lift_to_ground(root, base, lift, notes)
                 made = assembly.description(root)
@@ -233,6 +233,15 @@ class _Loading:
                 "with --base free, or kind = 'free' in [base] of its TOML file, the legs carry it"
             )
         return "planar"
+
+    def _height_on_feet(self, described: RobotDescription) -> float:
+        """Returns the height [m] of the root link of a robot that stands at home. Raises :class:`DescriptionError` if
+        it would fall through the ground."""
+        lowest = lowest_point(described.to_spec("robot"))
+        if lowest is None:
+            found = "nothing of it collides, so that a free base would fall through the ground"
+            raise description_error(self.file, found, "give its links <collision> shapes, or choose the base 'planar'")
+        return -lowest
 
     def _with_sensors(self, sidecar: Sidecar) -> tuple[Sidecar, tuple[RenderedMount, ...]]:
         """Returns the TOML file's content with the robot's IMUs, and the robot's rendered sensors.
