@@ -421,6 +421,18 @@ def test_joint_trajectory_comes_back():
     assert commands.joint_trajectory(trajectory(), "c", ("a", "b")).positions.shape == (0, 2)
 
 
+def test_commands_may_use_the_names_of_joints_in_the_robot_file():
+    renamed = {"Joint 1": "a", "Плечо": "b"}
+    message = trajectory((1.0, [1.0, 2.0], []))
+    message.joint_names = ["Плечо", "a"]
+    assert commands.joint_trajectory(message, "c", ("a", "b"), renamed=renamed).joints == ("b", "a")
+    message.joint_names = ["Joint 1", "a"]  # one joint by both of its names
+    with pytest.raises(commands.CommandError, match="each at most once"):
+        commands.joint_trajectory(message, "c", ("a", "b"), renamed=renamed)
+    states = JointState(name=["Joint 1", "b"], position=[0.1, 0.2])
+    assert commands.hardware_command(states, "c", ("a", "b"), (), renamed).joints == ("a", "b")
+
+
 @pytest.mark.parametrize(
     ("message", "words"),
     [

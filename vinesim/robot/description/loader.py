@@ -26,7 +26,7 @@ from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has n
 
 from vinesim.core import frames
 from vinesim.rigid.robot_body import lowest_point
-from vinesim.robot.description.controllers import command_interfaces, make_controllers
+from vinesim.robot.description.controllers import command_interfaces, make_controllers, with_original_names
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.drive_parameters import home_positions, make_drives
 from vinesim.robot.description.extent import bounds, feet, link_boxes, size_warning
@@ -139,6 +139,8 @@ class _Loading:
         check_numbers(self.root, self.file)
         self.originals = make_names_valid(self.root, self.assumed)
         renamed = {old: new for new, old in self.originals.items()}
+        if renamed:
+            self.notes.append("replaced names: " + ", ".join(f"{old!r} by {new!r}" for old, new in renamed.items()))
         self.home = {renamed.get(joint, joint): position for joint, position in source.home.items()}
         self.meshes: dict[str, np.ndarray] = {}
         self.ros_urdf = ""
@@ -210,6 +212,7 @@ class _Loading:
             is_remote=self.is_remote,
             ros_urdf=self.ros_urdf,
             original_names=self.originals,
+            controllers=with_original_names(description.controllers, self.originals),
         )
 
     def _base_kind(self, wanted: BaseKind, base: str, standing: Mapping[str, np.ndarray], has_wheels: bool) -> BaseKind:

@@ -50,6 +50,11 @@ class Robot(RobotInstance):
         """
         super().__init__(rigid, description, name, index, pose)
         self._joint_index = {drive.joint: i for i, drive in enumerate(description.drives)}
+        self._joint_index |= {
+            description.original_names[joint]: i
+            for joint, i in self._joint_index.items()
+            if joint in description.original_names
+        }
         self._cutters: dict[str, list[Blade]] = {}
         self._physics: Physics | None = None
         self._body_sensors = BodySensors(rigid, self.name, description)
@@ -108,7 +113,8 @@ class Robot(RobotInstance):
     # ------------------------------------------------------------------ commands
 
     def joint_indices(self, joints: Joints) -> np.ndarray:
-        """Returns the indices of joints in joint arrays. Raises :class:`CommandError` for a joint without a drive."""
+        """Returns the indices of joints in joint arrays. Raises :class:`CommandError` for a joint without a
+        drive. Names may be those of the robot file, too."""
         if joints is None:
             return np.arange(len(self.setpoint))
         if isinstance(joints, np.ndarray):
@@ -116,7 +122,7 @@ class Robot(RobotInstance):
         try:
             return np.array([self._joint_index[joint] for joint in joints], int)
         except KeyError as error:
-            known = ", ".join(self._joint_index)
+            known = ", ".join(self.description.joints)
             raise CommandError(f"{self.name} has no drive for {error.args[0]!r}; it drives: {known}") from None
 
     def command_position(self, position: Values, joints: Joints = None) -> None:

@@ -114,6 +114,9 @@ class ControllerSpec:
     """Name of the joint group of the gripper; empty if the controller does not control a gripper."""
     gripper: str = ""
     """Kind of the gripper, see :mod:`vinesim.robot.description.grippers`; empty for other controllers."""
+    renamed: Mapping[str, str] = dataclasses.field(default_factory=dict, compare=False)
+    """Names of joints by those that they have in the robot file, where these are not valid in ROS. Commands may use
+    either."""
     hardware: HardwareTopics | None = None
     """Topics of a controller of the kind ``topic_based``; None for other controllers."""
 
