@@ -22,7 +22,7 @@ if middleware.unavailable_reason() is not None:
 
 from geometry_msgs.msg import TransformStamped, TwistStamped
 from rclpy.serialization import deserialize_message, serialize_message
-from sensor_msgs.msg import Image, PointCloud2, PointField
+from sensor_msgs.msg import Image, JointState, PointCloud2, PointField
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 

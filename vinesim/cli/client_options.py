@@ -20,8 +20,6 @@ ROLES = ("robot", "human", "spectator")
 
 DEFAULT_WORLD = "vineyard"
 
-BASES = ("auto", "planar", "free", "fixed")
-"""How the base of a robot moves."""
 CONTROLLERS = ("own", "none")
 """Whose controllers command a robot's joints: those of vinesim, or those of another controller manager."""
 STATUS_FORMATS = ("text", "json", "none")
@@ -281,8 +279,6 @@ def check_options(options: ClientOptions) -> None:
         )
     if options.controllers not in CONTROLLERS:
         raise UsageError(f"--controllers {options.controllers!r}: give {' or '.join(CONTROLLERS)}")
-    if options.base not in BASES:
-        raise UsageError(f"--base {options.base!r}: give {', '.join(BASES)}")
     if options.params_file is not None and not options.params_file.is_file():
         raise UsageError(f"--params-file {options.params_file}: there is no such file; give a ROS 2 parameter file")
     from vinesim.plants.device_buffers import find_device
