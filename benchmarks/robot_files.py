@@ -27,6 +27,10 @@ HELD = 0.01
 """[rad or m] Largest distance of a joint from its home position at which a robot counts as holding its pose."""
 STILL = 1e-3
 """[m] Largest motion of the base of a robot that stands."""
+SETTLING = 1.0
+"""[s] Time in which a robot on legs comes to rest. The pose that it then has is the one that it has to hold."""
+UPRIGHT = 0.1
+"""[rad] Largest angle between a standing robot on legs and the vertical."""
 TIME_LIMIT = 240.0
 """[s] Longest time for one robot file."""
 PICTURE = (320, 240)
@@ -134,27 +138,37 @@ def _stand(description: Any) -> dict[str, Any]:
     from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
     from vinesim.rigid.rigid_world import RigidWorld
-    from vinesim.robot.description.extent import bounds
+    from vinesim.robot.description.extent import bounds, link_boxes
     from vinesim.robot.drives.controlled_robot import Robot
     from vinesim.scene.builder import assemble
 
     model = assemble([])
     rigid = RigidWorld(model)
     robot = Robot(rigid, description, "robot")
+    kind = description.base_limits.kind
     start = rigid.base_state("robot")[0].copy()
+    home = description.home
     drift = 0.0
     now = 0.0
-    for _ in range(round(STANDING / rigid.dt)):
+    for step in range(round(STANDING / rigid.dt)):
+        if kind == "free" and step == round(SETTLING / rigid.dt):
+            start = rigid.base_state("robot")[0].copy()
+            home = rigid.joint_state("robot")[0].copy()
+            drift = 0.0
         robot.control(now)
         rigid.predict()
         rigid.integrate()
         now += rigid.dt
         position = rigid.joint_measurements("robot")[0]
-        drift = max(drift, float(np.abs(position - description.home).max(initial=0.0)))
-    moved = float(np.linalg.norm(rigid.base_state("robot")[0][:3] - start[:3]))
-    holds = bool(np.isfinite([drift, moved]).all() and drift < HELD and moved < STILL)
+        drift = max(drift, float(np.abs(position - home).max(initial=0.0)))
+    end = rigid.base_state("robot")[0]
+    moved = float(np.linalg.norm(end[:3] - start[:3]))
+    tilt = float(np.arccos(np.clip(frames.to_matrix(end[3:])[2, 2], -1.0, 1.0)))
+    holds = bool(np.isfinite([drift, moved, tilt]).all() and drift < HELD and moved < STILL and tilt < UPRIGHT)
     shapes = [shape for visual in rigid.visuals() for shape in visual.shapes]
     seen = {
+        "base": kind,
+        "tilt": float(f"{tilt:.2g}"),
         "drift": float(f"{drift:.2g}"),
         "moved_m": float(f"{moved:.2g}"),
         "holds": holds,
@@ -163,7 +177,7 @@ def _stand(description: Any) -> dict[str, Any]:
     }
     if not shapes:
         return seen | {"pixels": 0, "visible": False}
-    box = bounds(description, etree.fromstring(description.urdf.encode()))
+    box = bounds(link_boxes(description, etree.fromstring(description.urdf.encode())))
     assert box is not None, "a robot with shapes has bounds"
     pixels = _pixels(model, rigid, box)
     return seen | {"pixels": pixels, "visible": pixels >= LEAST_PIXELS}

@@ -25,6 +25,7 @@ from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.description.shown import shown_urdf
 from vinesim.robot.description.urdf import DescriptionError
+from vinesim.robot.drives.joint_servos import CommandError
 from vinesim.scene.values import CameraMount, GnssMount, LidarMount
 
 MOMENTS = 'ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"'
@@ -321,6 +322,13 @@ def test_names_that_ros_does_not_accept_are_replaced_everywhere(
     for name in (*joints, *frames_of_robot, described.name, *(one.name for one in described.controllers)):
         assert re.fullmatch(pattern, name), name
     assert {described.original_names[name] for name in joints} == set(names)
+    assert any("'3rd' by 'joint_3rd'" in note for note in described.notes)  # one note has all of them
+    assert {old for one in described.controllers for old in one.renamed} == set(names)
+    anna = Yard(described).robot
+    anna.command_position([0.1, 0.2], ["3rd", "Joint-1"])  # as in the robot file
+    anna.command_position([0.3], ["joint_3rd"])
+    with pytest.raises(CommandError, match=r"no drive for '4th'; it drives: Joint_1, "):
+        anna.command_position([0.1], ["4th"])
     assert described.imus[0].frame == "base_link"
     shown = etree.fromstring(described.ros_urdf)
     assert {one.get("name") for one in shown.iterfind("joint")} == joints

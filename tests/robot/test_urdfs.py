@@ -17,6 +17,7 @@ from tests.support.robot_yard import Yard
 from vinesim.core import frames
 from vinesim.net.codec.robot import decode_robot, encode_robot
 from vinesim.rigid.urdf import shapes_of
+from vinesim.robot.description.drive_parameters import FULL_EFFORT_ANGLE
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.description.packages import find_installed
 from vinesim.robot.description.urdf import DescriptionError
@@ -231,16 +232,19 @@ FIT = [file for file in FILES if not is_refused(file)]
 @pytest.mark.slow
 @pytest.mark.parametrize("file", [*FIT[::8], *long(*(file for file in FIT if file not in FIT[::8]))])
 def test_each_robot_of_example_robot_data_holds_its_pose(file: str, caplog: pytest.LogCaptureFixture) -> None:
-    """For 2 s all joints stay within 2 mrad (mm) and the base within 0.1 mm; at most one warning."""
+    """For 2 s all joints stay within 2 mrad (mm) and the base within 0.1 mm; at most one warning. Legs that carry the
+    robot give way, by less than the angle at which their servos have full effort."""
     assert ROBOTS is not None
     description = load_description(ROBOTS / file)
     yard = Yard(description)
     warned = warnings_of(caplog)
     assert len(warned) <= 1, warned
     rows = yard.run(2.0)
-    assert np.abs(rows[:, 0] - description.home).max(initial=0.0) < 2e-3
+    stands = description.base_limits.kind == "free"
+    assert np.abs(rows[:, 0] - description.home).max(initial=0.0) < (FULL_EFFORT_ANGLE if stands else 2e-3)
     assert np.abs(rows[-1, 1]).max(initial=0.0) < 1e-3
-    np.testing.assert_allclose(yard.rigid.base_state("anna")[0], frames.pose([0.0, 0.0, 0.0]), atol=1e-4)
+    away = 1e-2 if stands else 1e-4
+    np.testing.assert_allclose(yard.rigid.base_state("anna")[0], frames.pose([0.0, 0.0, 0.0]), atol=away)
 
 
 @pytest.mark.parametrize("file", [file for file in FILES if is_refused(file)])

@@ -22,7 +22,7 @@ if middleware.unavailable_reason() is not None:
 
 from geometry_msgs.msg import TransformStamped, TwistStamped
 from rclpy.serialization import deserialize_message, serialize_message
-from sensor_msgs.msg import Image, PointCloud2, PointField
+from sensor_msgs.msg import Image, JointState, PointCloud2, PointField
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -287,6 +287,10 @@ def test_odometry_is_what_was_measured_with_its_covariances():
         found = np.reshape(part.covariance, (6, 6))
         assert np.array_equal(found[np.ix_((0, 1, 5), (0, 1, 5))], expected)
         assert found[2:5, 2:5].tolist() == np.diag([convert.UNMEASURED] * 3).tolist()
+    on_legs = convert.odometry(dataclasses.replace(sample, odom_is_spatial=True), "base_footprint", "odom")
+    for part, expected in zip((on_legs.pose, on_legs.twist), covariance, strict=True):
+        found = np.reshape(part.covariance, (6, 6))
+        assert found[2:5, 2:5].tolist() == np.diag([expected[0, 0]] * 3).tolist()
 
 
 def test_wrench_and_imu_keep_their_frames():
@@ -415,6 +419,18 @@ def test_joint_trajectory_comes_back():
     assert value.velocities.tolist() == [[0.1, 0.2], [0.0, 0.0]]
     assert commands.joint_trajectory(trajectory((1.0, [1.0, 2.0], [])), "c", ("a", "b")).velocities is None
     assert commands.joint_trajectory(trajectory(), "c", ("a", "b")).positions.shape == (0, 2)
+
+
+def test_commands_may_use_the_names_of_joints_in_the_robot_file():
+    renamed = {"Joint 1": "a", "Плечо": "b"}
+    message = trajectory((1.0, [1.0, 2.0], []))
+    message.joint_names = ["Плечо", "a"]
+    assert commands.joint_trajectory(message, "c", ("a", "b"), renamed=renamed).joints == ("b", "a")
+    message.joint_names = ["Joint 1", "a"]  # one joint by both of its names
+    with pytest.raises(commands.CommandError, match="each at most once"):
+        commands.joint_trajectory(message, "c", ("a", "b"), renamed=renamed)
+    states = JointState(name=["Joint 1", "b"], position=[0.1, 0.2])
+    assert commands.hardware_command(states, "c", ("a", "b"), (), renamed).joints == ("a", "b")
 
 
 @pytest.mark.parametrize(

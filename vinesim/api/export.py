@@ -4,14 +4,24 @@ from __future__ import annotations
 
 import os
 import pathlib
+from collections.abc import Mapping, Sequence
 
-from vinesim.api.simulation import Source, model_of
+import numpy as np
+
+from vinesim.api.simulation import Source, base_pose, model_of
 from vinesim.export.vineyard_file import check_file, write_vineyard
+from vinesim.robot.description.loader import load_description
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.spec import Scene, load_scene
 
 
-def export_vineyard(source: Source, file: str | os.PathLike[str], *, leaves: bool = False) -> None:
+def export_vineyard(
+    source: Source,
+    file: str | os.PathLike[str],
+    *,
+    leaves: bool = False,
+    robots: Mapping[str, tuple[str | pathlib.Path, Sequence[float] | np.ndarray]] = {},
+) -> None:
     """Write a vineyard or canes for another simulator: bodies on hinges with springs, wood, wires, ground, boxes.
 
     docs/export.md explains what each format contains.
@@ -21,10 +31,14 @@ def export_vineyard(source: Source, file: str | os.PathLike[str], *, leaves: boo
         file: MJCF (``.xml``), URDF (``.urdf``), or OpenUSD (``.usda``, ``.usdc``, ``.usd``), which needs the extra
             ``export``.
         leaves: whether leaves are drawn. They never collide; their mass is always part of their cane.
+        robots: robots at rest beside the plants, by name: file or name of the robot, and its pose as in
+            :meth:`Simulation.add_robot`. In MJCF only.
 
     Raises:
         UsdMissing: usd-core is not installed.
-        UsageError: the suffix is unknown, or the folder of the file does not exist.
+        UsageError: the suffix is unknown, the folder of the file does not exist, or the format has no robots.
+        DescriptionError: a robot cannot be used.
+        RobotError: a robot cannot be written.
         WriteError: the file cannot be written.
     """
     path = check_file(file)
@@ -35,4 +49,9 @@ def export_vineyard(source: Source, file: str | os.PathLike[str], *, leaves: boo
     if isinstance(source, Scene):
         name = source.name
         parameters = source.physics
-    write_vineyard(model_of(source), path, name=name, leaves=leaves, parameters=parameters)
+    model = model_of(source)
+    specs = [
+        load_description(robot).to_spec(called, index, base_pose(pose, model.terrain))
+        for index, (called, (robot, pose)) in enumerate(robots.items())
+    ]
+    write_vineyard(model, path, name=name, leaves=leaves, parameters=parameters, robots=specs)

@@ -295,6 +295,7 @@ class Simulation:
         pose: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
         *,
         name: str = "",
+        base: str = "auto",
     ) -> Robot:
         """Add a robot, given by a name from ``data/robots`` or the path of a URDF, xacro, SDF or MJCF file.
 
@@ -302,8 +303,10 @@ class Simulation:
             robot: name or path; :class:`~vinesim.robot.description.urdf.DescriptionError` if it cannot be used.
             pose: (x, y, yaw) in m and rad, or [7] position and quaternion of the base.
             name: unique name of this robot; ``robot_0``, ``robot_1``, ... unless given.
+            base: how the base moves: ``planar`` (driven), ``free`` (the robot stands on its legs), ``fixed``, or
+                ``auto``: as the robot's files say.
         """
-        described = load_description(robot)
+        described = load_description(robot, base=base)
         index = self._robots_added
         name = name or f"robot_{index}"
         if name in self.physics.rigid.robots:

@@ -78,6 +78,14 @@ class ClientOptions:
         OF_ROBOT,
         typer.Option(metavar="NAME:=VALUE", help="Robots: arguments of a xacro file, separated by blanks."),
     ] = None
+    base: Annotated[
+        str,
+        OF_ROBOT,
+        typer.Option(
+            help="Robots: how the base moves: planar (driven), free (the robot stands on its legs) or fixed (bolted "
+            "down). auto: as the robot's files say."
+        ),
+    ] = "auto"
     spawn: Annotated[
         int | None,
         typer.Option(

@@ -16,7 +16,7 @@ from vinesim.client.recording.state_digest import StateDigest
 from vinesim.client.tasks.motions import DriveTo, LookAt
 from vinesim.client.tasks.planning import plan_task, validate_task_name
 from vinesim.client.tasks.start_poses import start_pose, validate_bunch
-from vinesim.core.errors import writing
+from vinesim.core.errors import UsageError, writing
 from vinesim.net.transport.bus import Bus
 from vinesim.robot.description.controllers import only_hardware
 from vinesim.robot.description.description import RobotDescription
@@ -31,9 +31,10 @@ def run(options: ClientOptions) -> int:
     """Build the client from its options, step until the end, then write the requested files. Returns the exit code."""
     validate_task_name(options.job)
     descriptions = [
-        load_description(robot, srdf=options.srdf, xacro_args=options.xacro_args or ())
+        load_description(robot, srdf=options.srdf, xacro_args=options.xacro_args or (), base=options.base)
         for robot in options.robot or ["vinebot"]
     ]
+    _check_driven(options, descriptions)
     if options.controllers == "none":
         descriptions = [only_hardware(description) for description in descriptions]
     with ClientSession(options) as session:
@@ -90,6 +91,15 @@ def run(options: ClientOptions) -> int:
                 with writing(options.out / "trace.npz"):
                     client.trace.rows().save(options.out / "trace.npz")
     return 0
+
+
+def _check_driven(options: ClientOptions, descriptions: list[RobotDescription]) -> None:
+    """Raise :class:`UsageError` if an option drives the base of a robot on legs."""
+    driving = {"--job": options.job, "--push": options.push, "--approach": options.approach or None}
+    given = next((f"{flag} {value}" for flag, value in driving.items() if value is not None), None)
+    standing = next((one.name for one in descriptions if one.base_limits.kind == "free"), None)
+    if given is not None and standing is not None:
+        raise UsageError(f"{given} drives the base, but {standing} stands on its legs; give --base planar, too")
 
 
 def _start_sensors(

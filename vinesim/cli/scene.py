@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import pathlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from vinesim.cli.render import parse_composition
 from vinesim.core import frames
 from vinesim.core.errors import WriteError
 from vinesim.export.vineyard_file import check_file, write_vineyard
@@ -61,11 +63,13 @@ def show(file: str, seed: int | None, out: pathlib.Path | None) -> int:
     return 0
 
 
-def export_scene(file: str, seed: int | None, out: pathlib.Path, leaves: bool) -> int:
+def export_scene(file: str, seed: int | None, out: pathlib.Path, leaves: bool, robots: Sequence[str] = ()) -> int:
     """Write a scene for another simulator, and print what was written. Returns the exit code."""
     path = check_file(out, "--out")
     scene = with_seed(load_scene(file), seed)
-    made = write_vineyard(generate(scene), path, name=scene.name, leaves=leaves, parameters=scene.physics)
+    model = generate(scene)
+    specs = parse_composition(robots, (), ()).robot_specs(model.terrain) if robots else ()
+    made = write_vineyard(model, path, name=scene.name, leaves=leaves, parameters=scene.physics, robots=specs)
     print(
         f"{path}: {len(made.links)} bodies of plants, {sum(link.mass for link in made.links):.4g} kg; "
         f"{len(made.ties)} ties, {len(made.fixed)} fixed pieces, {len(made.crates)} boxes; "

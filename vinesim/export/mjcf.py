@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 
 import numpy as np
 
 from vinesim.core import frames
 from vinesim.export.articulation import COLORS, HINGES, Capsule, Tie, Vineyard
 from vinesim.export.xml_text import add, text
+from vinesim.rigid.robot_mjcf import RobotDocument
 from vinesim.scene.ids import Organ
 from vinesim.scene.terrain import Terrain
 
@@ -19,11 +21,11 @@ which is 5e-5 m for 1 cm."""
 _Element = ElementTree.Element
 
 
-def mjcf(vineyard: Vineyard) -> _Element:
-    """Returns the root of the MJCF document.
+def mjcf(vineyard: Vineyard, robots: Sequence[RobotDocument] = ()) -> _Element:
+    """Returns the root of the MJCF document, with ``robots``.
 
     A ball joint becomes three hinges. A tie becomes three tendons, each an independent spring along one axis. Plants do
-    not collide with each other.
+    not collide with each other. With robots there is a keyframe ``home``: the drawn shape, and the robots at rest.
     """
     root = _Element("mujoco", model=vineyard.name)
     add(root, "compiler", angle="radian", autolimits="true")
@@ -51,6 +53,14 @@ def mjcf(vineyard: Vineyard) -> _Element:
         tendons = add(root, "tendon")
         for tie in vineyard.ties:
             _add_tie(world, bodies[tie.link], tendons, tie)
+    if robots:
+        for robot in robots:
+            robot.add_to(root)
+        crates = [np.concatenate([one.pose[:3], frames.to_wxyz(one.pose[3:])]) for one in vineyard.crates]
+        plants = np.zeros(len(HINGES) * len(vineyard.links))
+        qpos = np.concatenate([*crates, plants, *(robot.qpos for robot in robots)])
+        ctrl = np.concatenate([robot.ctrl for robot in robots])
+        add(add(root, "keyframe"), "key", name="home", qpos=text(*qpos), ctrl=text(*ctrl))
     return root
 
 

@@ -62,6 +62,8 @@ class PairFriction:
 # Assistant. The pairs in the ``disable_collisions`` elements of an SRDF file are excluded too.
 
 
+FAR = 100.0
+"""[m] Depth below a robot of the plane to which the distance of its lowest point is measured."""
 HOME_CLEARANCE = 1e-3
 """Distance [m] between two links, or a link and the ground, below which they count as overlapping in the home pose.
 
@@ -72,8 +74,8 @@ def let_links_collide(parsed: mujoco.MjSpec, given: RobotSpec, code: int, cleara
     """Enable collisions of a ``parsed`` robot's links with each other and with the ground.
 
     ``given``: the robot's settings; ``code``: its collision code; ``clearance``: height of the base above the ground
-    [m]. Shapes that are fixed to the base do not collide with the ground, because the base moves in a plane at constant
-    height, or follows uneven ground.
+    [m]. Shapes that are fixed to a driven base do not collide with the ground, because the base moves in a plane at
+    constant height, or follows uneven ground.
     """
     alone = parsed.copy()
     for number, geom in enumerate(alone.geoms):
@@ -92,11 +94,12 @@ def let_links_collide(parsed: mujoco.MjSpec, given: RobotSpec, code: int, cleara
     for pair in disabled_pairs(given.urdf):
         if links.issuperset(pair):
             parsed.add_exclude(bodyname1=pair[0], bodyname2=pair[1])
-    standing = set(geoms[on_ground.any(1)].ravel().tolist())
+    standing = set() if given.has_free_base else set(geoms[on_ground.any(1)].ravel().tolist())
     for number, geom in enumerate(parsed.geoms):
         geom.conaffinity |= code
         compiled = m.geom(str(number))
-        if m.body_weldid[compiled.bodyid[0]] != 0 and compiled.id not in standing:
+        moves = given.has_free_base or m.body_weldid[compiled.bodyid[0]] != 0
+        if moves and compiled.id not in standing:
             geom.conaffinity |= GROUND
 
 
@@ -112,16 +115,36 @@ def disabled_pairs(urdf: str) -> list[tuple[str, str]]:
 
 def _touching_at_home(m: mujoco.MjModel, given: RobotSpec) -> np.ndarray:
     """Returns the pairs of geoms [pair, 2] that touch in the home pose; ``m``: the robot alone, with its base fixed."""
+    return _collide_at_home(m, given).contact.geom.reshape(-1, 2).copy()
+
+
+def _collide_at_home(m: mujoco.MjModel, given: RobotSpec, prefix: str = "") -> mujoco.MjData:
+    """Returns the contacts of a robot that is alone in its home pose. ``prefix``: before the names of its joints."""
     d = mujoco.MjData(m)
     for drive, position in zip(given.drives, given.home, strict=True):
-        d.joint(drive.joint).qpos[0] = position
+        d.joint(prefix + drive.joint).qpos[0] = position
     for e in np.flatnonzero(m.eq_type == mujoco.mjtEq.mjEQ_JOINT).tolist():
         polynomial = np.polynomial.Polynomial(m.eq_data[e, :5])
         d.qpos[m.jnt_qposadr[m.eq_obj1id[e]]] = polynomial(d.qpos[m.jnt_qposadr[m.eq_obj2id[e]]])
     mujoco.mj_kinematics(m, d)
     mujoco.mj_comPos(m, d)
     mujoco.mj_collision(m, d)
-    return d.contact.geom.reshape(-1, 2).copy()
+    return d
+
+
+def lowest_point(parsed: mujoco.MjSpec, given: RobotSpec) -> float | None:
+    """Returns the height [m] of the lowest point of a ``parsed`` robot's shapes at home, above the origin of its root
+    link; None if nothing of it collides. ``given``: the robot's settings."""
+    world = mujoco.MjSpec()
+    base = world.worldbody.add_body()
+    base.add_freejoint()  # MuJoCo finds no contacts between two fixed bodies
+    world.attach(parsed.copy(), prefix="robot/", frame=base.add_frame())
+    for geom in world.geoms:
+        geom.contype, geom.conaffinity = 1, 0
+    plane = world.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0.0, 0.0, -FAR])
+    plane.contype, plane.conaffinity, plane.margin = 0, 1, 2.0 * FAR
+    distance = _collide_at_home(compile_without_contacts(world), given, "robot/").contact.dist
+    return float(distance.min()) - FAR if len(distance) else None
 
 
 # Speculative contacts of fast crates, so that thin walls do not end up inside each other.

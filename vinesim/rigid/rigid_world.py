@@ -163,7 +163,7 @@ class RigidWorld(MujocoWorld):
         self._replace_world(compiled)
         for actor in added:
             if isinstance(actor, RobotBody) and actor not in replaced:
-                self.place_robot(actor.spec.name, actor.spec.pose, actor.spec.home)
+                self.place_robot(actor.spec.name, actor.start_pose, actor.spec.home)
         return True
 
     def actor_position(self, name: str) -> np.ndarray:
@@ -218,6 +218,9 @@ class RigidWorld(MujocoWorld):
             self._speculative_contacts.limit_closing(m, d)
         if self._soft_wires is not None:
             self._soft_wires.soften(m, d)
+        for robot in self._robots.values():
+            if robot.free_base is not None:
+                robot.free_base.load(m, d)
         d.qfrc_applied.fill(0.0)
         # the whole forward pass after the velocity stage, because calls of its parts omit dt K v
         mujoco.mj_forwardSkip(m, d, mujoco.mjtStage.mjSTAGE_VEL, 1)
@@ -339,7 +342,7 @@ class RigidWorld(MujocoWorld):
         for name in recompile.DOF_ARRAYS:
             getattr(d, name)[dofs] = 0.0
         for name, robot in self._robots.items():
-            if faulty[m.dof_treeid[robot.base_v[0]]]:
+            if faulty[m.body_treeid[robot.bodies[robot.spec.base]]]:
                 self.place_robot(name, self.base_state(name)[0], d.qpos[robot.q].copy())
                 robot.feedforward[:] = 0.0
         stopped = [m.body(m.tree_bodyadr[tree]).name for tree in np.flatnonzero(faulty)]
@@ -397,8 +400,11 @@ class RigidWorld(MujocoWorld):
         self.robot(name).set_gains(self.mj_model, self.mj_data, (stiffness, damping, effort), limit, exact)
 
     def command_base(self, name: str, velocity: tuple[float, float, float]) -> None:
-        """Drive the base with (vx, vy, wz) [m/s, m/s, rad/s] in its own axes; zero holds it in place."""
+        """Drive the base with (vx, vy, wz) [m/s, m/s, rad/s] in its own axes; zero holds it in place. Raises
+        :class:`RobotError` for a free base."""
         robot = self.robot(name)
+        if robot.free_base is not None:
+            raise RobotError(f"robot {name!r} stands on its legs: nothing drives its base; command its joints")
         _check_finite(name, "base velocity", velocity, 3)
         robot.base_velocity[:] = velocity
         robot.base_slip = self.parameters.base_slip
@@ -416,7 +422,7 @@ class RigidWorld(MujocoWorld):
         _check_finite(name, "base pose", base_q, 7)
         _check_finite(name, "base velocity", base_qd, 6)
         self.robot(name).follow_remote(
-            self.mj_data, np.asarray(base_q, float), np.asarray(base_qd, float), position, velocity
+            self.mj_model, self.mj_data, np.asarray(base_q, float), np.asarray(base_qd, float), position, velocity
         )
 
     def apply_wrench(self, name: str, link: str, force: np.ndarray, moment: np.ndarray = np.zeros(3)) -> None:

@@ -1,5 +1,6 @@
 """One robot in MuJoCo's world: a planar base on servos, driven joints, sensors in links. On uneven ground the base also
-follows the ground (:mod:`vinesim.rigid.ground_following`).
+follows the ground (:mod:`vinesim.rigid.ground_following`). A robot on legs has a free base instead
+(:mod:`vinesim.rigid.free_base`).
 
 MuJoCo's integrator damps a servo of stiffness K as if its damping D were larger by dt K. This keeps stiff servos and
 their loads from oscillating. A compliant joint, however, must swing with exactly the damping D; for such a joint
@@ -20,6 +21,7 @@ from vinesim.core.warp_arrays import SharedArrays, share
 from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.rigid import joint_servos
 from vinesim.rigid import ground_following, mujoco_contacts, recompile
+from vinesim.rigid.free_base import FreeBase
 from vinesim.rigid.ground_following import GroundFollower
 from vinesim.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, contact_friction, geom_user
 from vinesim.rigid.urdf import RobotError, check, collision_materials, collision_urdf, link_friction, shapes_of_robot
@@ -91,12 +93,25 @@ class RobotBody:
         """[m] Height z of the base, which moves in a horizontal plane."""
         self.base_velocity = np.zeros(3)
         """[3] vx, vy, wz (m/s, m/s, rad/s), commanded velocity in the base's own axes."""
-        self.follower = None if terrain is None or footprint is None else GroundFollower(terrain, footprint)
-        """Lets the base follow uneven ground; None: the base moves in a plane at constant height."""
+        is_driven = not spec.has_free_base
+        self.follower = (
+            GroundFollower(terrain, footprint) if is_driven and terrain is not None and footprint is not None else None
+        )
+        """Lets a driven base follow uneven ground; None: the base moves in a plane at constant height, or freely."""
+        self.start_pose = pose
+        """[7] Pose of the base at the start. On uneven ground a free base stands as steep as the ground."""
+        if spec.has_free_base and not spec.is_copy and terrain is not None and footprint is not None:
+            self.start_pose = terrain.resting_pose(pose[0], pose[1], frames.to_yaw(pose[3:]), footprint)
         self._level_velocity = self.base_velocity if self.follower is None else np.zeros(3)
         """[3] The commanded velocity seen from above, in axes with the base's yaw."""
         self.base_gains = _base_gains(spec, parameters)
         """Stiffness and damping [3] of the base's servos along x, y and about z."""
+        self.free_base: FreeBase | None = None
+        """The base of a robot that stands on its legs; None: the base is driven."""
+        if spec.has_free_base:
+            linear_and_angular = np.repeat([0, 2], 3)
+            stiffness, damping = (gains[linear_and_angular] for gains in self.base_gains)
+            self.free_base = FreeBase(stiffness, damping, np.repeat(spec.base_effort, 3))
         self._base_slip = np.array([parameters.base_slip])
         self.has_exact_damping = np.zeros(joints, bool)
         """[joint] bool, whether the joint is damped by exactly the set damping; see :func:`split_damping`."""
@@ -109,7 +124,7 @@ class RobotBody:
         self.inertia_index = np.zeros(0, int)
         """[joint] Index of the drive's own inertia in MuJoCo's sparse mass matrix."""
         self.base_q = self.base_v = self.base_actuator = np.zeros(0, int)
-        """[3] Indices of the base's x, y and yaw in MuJoCo's qpos, qvel and ctrl."""
+        """[3] Indices of a driven base's x, y and yaw in MuJoCo's qpos, qvel and ctrl."""
         self.bodies: dict[str, int] = {}
         self.sensor_links: list[str] = []
         """Links with a sensor, see :meth:`RigidWorld.add_link_sensor`."""
@@ -141,9 +156,20 @@ class RobotBody:
     # ------------------------------------------------------------------ in MuJoCo
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
-        """Add the robot to a world, on a planar base and with its servos."""
+        """Add the robot to a world, on its base and with its servos."""
         given = self.spec
-        name = self.spec.name
+        base = self._add_driven_base(spec) if self.free_base is None else self.free_base.add_to(spec, given.name)
+        spec.copy_during_attach = True
+        spec.attach(self._parsed, prefix=f"{given.name}/", frame=base.add_frame())
+        for drive, stiffness, damping in zip(given.drives, self.stiffness, self.damping, strict=True):
+            _add_servo(spec, f"{given.name}/{drive.joint}", stiffness, damping, drive.effort)
+        if self.free_base is None:
+            self._add_base_servos(spec)
+
+    def _add_driven_base(self, spec: mujoco.MjSpec) -> mujoco.MjsBody:
+        """Add the body of a driven base, with its joints, and return it."""
+        given = self.spec
+        name = given.name
         height = float(given.pose[2]) if self.follower is None else 0.0
         base = spec.worldbody.add_body(name=name, pos=[0.0, 0.0, height])
         slide = mujoco.mjtJoint.mjJNT_SLIDE
@@ -156,13 +182,13 @@ class RobotBody:
         if self.follower is not None:
             base.add_joint(name=f"{name}:pitch", type=hinge, axis=[0.0, 1.0, 0.0])
             base.add_joint(name=f"{name}:roll", type=hinge, axis=[1.0, 0.0, 0.0])
-        spec.copy_during_attach = True
-        spec.attach(self._parsed, prefix=f"{name}/", frame=base.add_frame())
-        for drive, stiffness, damping in zip(given.drives, self.stiffness, self.damping, strict=True):
-            _add_servo(spec, f"{name}/{drive.joint}", stiffness, damping, drive.effort)
+        return base
+
+    def _add_base_servos(self, spec: mujoco.MjSpec) -> None:
+        name = self.spec.name
         stiffness, damping = self.base_gains
         for i, axis in enumerate(_PLANAR):
-            _add_servo(spec, f"{name}:{axis}", stiffness[i], damping[i], given.base_effort[i // 2])
+            _add_servo(spec, f"{name}:{axis}", stiffness[i], damping[i], self.spec.base_effort[i // 2])
         if self.follower is not None:
             for axis in ground_following.AXES:  # GroundFollower.find_indices() sets the gains
                 _add_servo(spec, f"{name}:{axis}", 0.0, 0.0, ground_following.MAX_EFFORT)
@@ -171,7 +197,7 @@ class RobotBody:
         """Look up the MuJoCo indices of the robot's bodies and joints in a recompiled world."""
         name = self.spec.name
         driven = [f"{name}/{drive.joint}" for drive in self.spec.drives]
-        planar = [f"{name}:{axis}" for axis in _PLANAR]
+        planar = [] if self.free_base is not None else [f"{name}:{axis}" for axis in _PLANAR]
         joints, base = ([names.joint[joint] for joint in some] for some in (driven, planar))
         self.q = m.jnt_qposadr[joints].astype(int)
         self.v = m.jnt_dofadr[joints].astype(int)
@@ -182,6 +208,8 @@ class RobotBody:
         self.base_actuator = np.array([names.actuator[joint] for joint in planar], int)
         mine = name + "/"
         self.bodies = {n.removeprefix(mine): i for i, n in enumerate(names.bodies) if n.startswith(mine)}
+        if self.free_base is not None:
+            self.free_base.find_indices(m, names, name)
         if self.follower is not None:
             self.follower.find_indices(m, names, name, self.base_actuator[:2], self.spec.base_effort[0])
         self._set_gains(m)
@@ -190,8 +218,13 @@ class RobotBody:
     def place(self, m: mujoco.MjModel, d: mujoco.MjData, pose: np.ndarray, position: np.ndarray) -> None:
         """Put the robot at base ``pose`` [7] and ``position`` [joint], at rest, and make these its targets."""
         self.target[:] = d.qpos[self.q] = position
-        self.base_target[:] = d.qpos[self.base_q] = pose[0], pose[1], frames.to_yaw(pose[3:])
-        d.qvel[self.v] = d.qvel[self.base_v] = 0.0
+        self.base_target[:] = pose[0], pose[1], frames.to_yaw(pose[3:])
+        d.qvel[self.v] = 0.0
+        if self.free_base is not None:
+            self.free_base.place(d, np.asarray(pose, float))
+        else:
+            d.qpos[self.base_q] = self.base_target
+            d.qvel[self.base_v] = 0.0
         if self.follower is not None:
             self.follower.place(d, self.base_target)
         self.target_velocity[:] = self.base_velocity[:] = 0.0
@@ -266,12 +299,16 @@ class RobotBody:
             getattr(self, name)[:] = getattr(other, name)
         self.base_slip = other.base_slip
         self.base_height = other.base_height
+        if self.free_base is not None and other.free_base is not None:
+            self.free_base.take_over(other.free_base)
         self.indicator_color = other.indicator_color
         self.sensor_links = other.sensor_links
         self.remote_wrenches = other.remote_wrenches
 
     def base_state(self, d: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
         """Returns the pose [7] and the velocity [6] (world axes) of the base link."""
+        if self.free_base is not None:
+            return self.free_base.state(d)
         x, y, yaw = d.qpos[self.base_q].tolist()
         vx, vy, wz = d.qvel[self.base_v].tolist()
         if self.follower is not None:
@@ -288,7 +325,13 @@ class RobotBody:
         self.target_velocity[:] = 0.0 if velocity is None else velocity
 
     def follow_remote(
-        self, d: mujoco.MjData, base_q: np.ndarray, base_qd: np.ndarray, position: np.ndarray, velocity: np.ndarray
+        self,
+        m: mujoco.MjModel,
+        d: mujoco.MjData,
+        base_q: np.ndarray,
+        base_qd: np.ndarray,
+        position: np.ndarray,
+        velocity: np.ndarray,
     ) -> None:
         """Let the servos pull the copy of a remote robot to the state that its client has sent; see
         :meth:`RigidWorld.follow_remote`.
@@ -304,6 +347,9 @@ class RobotBody:
         pull = self.stiffness * (self.target - d.qpos[self.q]) + self.damping * (self.target_velocity - d.qvel[self.v])
         excess = pull - np.clip(pull, COPY_EFFORT_SHARE * low, COPY_EFFORT_SHARE * high)
         self.target -= excess / np.where(self.stiffness > 0.0, self.stiffness, np.inf)
+        if self.free_base is not None:
+            self.free_base.follow(m, base_q, base_qd)
+            return
         yaw = frames.to_yaw(base_q[3:])
         turns = np.round((d.qpos[self.base_q[2]] - yaw) / (2.0 * np.pi))
         self.base_target[:] = base_q[0], base_q[1], yaw + 2.0 * np.pi * turns
@@ -420,6 +466,17 @@ def _parse(given: RobotSpec, code: int, friction: float, clearance: float) -> mu
     if not given.is_copy:
         mujoco_contacts.let_links_collide(child, given, code, clearance)
     return child
+
+
+def lowest_point(spec: RobotSpec) -> float | None:
+    """Returns the height [m] of the lowest point of a robot at home, above the origin of its root link; None if nothing
+    of it collides. Raises :class:`RobotError` if MuJoCo cannot read the URDF."""
+    check(spec)
+    alone = dataclasses.replace(spec, is_copy=True)
+    try:
+        return mujoco_contacts.lowest_point(_parse(alone, 1, PhysicsParameters().friction, 0.0), alone)
+    except ValueError as error:
+        raise build_error(spec, error) from error
 
 
 def _base_gains(spec: RobotSpec, parameters: PhysicsParameters) -> tuple[np.ndarray, np.ndarray]:

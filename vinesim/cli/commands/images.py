@@ -77,6 +77,10 @@ def export(
     leaves: Annotated[
         bool, typer.Option("--leaves", help="Draw the leaves. They do not collide, and make the file twice as large.")
     ] = False,
+    robot: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME@X,Y,YAW", help="A robot at rest there [m, rad]; may be repeated. In MJCF only."),
+    ] = None,
 ) -> None:
     """Write a vineyard for another simulator: bodies on hinges with springs, wood, wires, ground, boxes.
 
@@ -86,12 +90,13 @@ def export(
     \b
     Examples:
       vinesim export demo --out vineyard.xml
+      vinesim export demo --robot my.urdf@2.5,0.2,1.57 --out vineyard.xml
       vinesim export vsp --seed 4 --out vsp.usdc
       vinesim export my-block.toml --leaves --out block.urdf
     """
     from vinesim.cli.scene import export_scene
 
-    raise typer.Exit(export_scene(scene, seed, out, leaves))
+    raise typer.Exit(export_scene(scene, seed, out, leaves, robot or []))
 
 
 def render(

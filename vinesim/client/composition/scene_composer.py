@@ -25,7 +25,7 @@ from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.terrain import Terrain, on_ground
-from vinesim.scene.values import HumanSpec, Snapshot
+from vinesim.scene.values import HumanSpec, RobotSpec, Snapshot
 from vinesim.sensors.primitives.scene_primitives import rest_snapshot
 
 if TYPE_CHECKING:
@@ -141,12 +141,20 @@ class SceneComposer:
         self._add_actors(physics.rigid)
         return physics.snapshot()
 
+    def robot_specs(self, terrain: Terrain | None) -> list[RobotSpec]:
+        """Returns the specifications of all robots on the ground. Raises :class:`DescriptionError`."""
+        return [
+            load_description(one.robot).to_spec(
+                f"robot_{index}", index=index, pose=_ground_pose(terrain, one.x, one.y, one.yaw)
+            )
+            for index, one in enumerate(self.robots)
+        ]
+
     def _add_actors(self, rigid: RigidWorld) -> None:
         """Add robots and people. Raises :class:`PlacementError` if one overlaps something."""
         terrain = rigid.model.terrain
-        for index, one in enumerate(self.robots):
-            pose = _ground_pose(terrain, one.x, one.y, one.yaw)
-            rigid.add_robot(load_description(one.robot).to_spec(f"robot_{index}", index=index, pose=pose))
+        for spec in self.robot_specs(terrain):
+            rigid.add_robot(spec)
         for index, one in enumerate(self.people):
             pose = appearance.apply_posture(
                 standing_pose(_ground_pose(terrain, one.x, one.y, one.yaw), one.height), one.posture, one.height

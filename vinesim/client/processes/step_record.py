@@ -33,6 +33,7 @@ class StepRecords:
         self._imus = tuple((mount.name, mount.frame) for mount in description.imus)
         self._wrenches = tuple((mount.name, mount.frame) for mount in description.wrenches)
         self._moving = description.moving_joints
+        self._is_free = description.base_limits.kind == "free"
         joints = len(self.joints)
         imus = len(self._imus)
         wrenches = len(self._wrenches)
@@ -150,4 +151,5 @@ class StepRecords:
                 for (name, frame), row in zip(self._imus[read], imus[read], strict=True)
             ),
             reference=JointReference(desired, desired_velocity),
+            odom_is_spatial=self._is_free,
         )

@@ -101,7 +101,8 @@ class JointDrives:
 
 @wp.struct
 class BaseDrive:
-    """Servos of a robot's planar base; each array is [3] for x, y and yaw, unless stated otherwise."""
+    """Servos of a robot's planar base; each array is [3] for x, y and yaw, unless stated otherwise. A free base has no
+    servos: ``q`` and ``actuator`` are empty."""
 
     stiffness: wp.array(dtype=wp.float64)
     damping: wp.array(dtype=wp.float64)
@@ -141,6 +142,8 @@ def apply_controls(
         control_out[i] = control
         actuator = drives.actuator[i]
         ctrl_out[actuator] = control
+    if base.actuator.shape[0] == 0:
+        return
     yaw = qpos[base.q[2]]
     c = wp.cos(yaw)
     s = wp.sin(yaw)

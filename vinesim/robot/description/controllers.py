@@ -124,6 +124,17 @@ def _hardware(name: str, given: Controller, file: pathlib.Path) -> HardwareTopic
     return HardwareTopics(**keys)
 
 
+def with_original_names(
+    controllers: Sequence[ControllerSpec], originals: Mapping[str, str]
+) -> tuple[ControllerSpec, ...]:
+    """Returns controllers that also know their joints by the names in the robot file. ``originals``: see
+    :attr:`RobotDescription.original_names`."""
+    return tuple(
+        dataclasses.replace(spec, renamed={originals[joint]: joint for joint in spec.joints if joint in originals})
+        for spec in controllers
+    )
+
+
 def only_hardware(description: RobotDescription) -> RobotDescription:
     """Returns the robot without controllers of joints: another controller manager commands its joints.
 
@@ -134,7 +145,8 @@ def only_hardware(description: RobotDescription) -> RobotDescription:
     if all(spec.hardware is None for spec in kept):
         joints = tuple(drive.joint for drive in description.drives)
         kept.append(ControllerSpec("hardware", ControllerKind.TOPIC_BASED, joints, hardware=HardwareTopics()))
-    return dataclasses.replace(description, controllers=tuple(sorted(kept, key=lambda spec: spec.name)))
+    kept.sort(key=lambda spec: spec.name)
+    return dataclasses.replace(description, controllers=with_original_names(kept, description.original_names))
 
 
 def _of_gripper(name: str, kind: str, group: str, sidecar: Sidecar) -> ControllerSpec:

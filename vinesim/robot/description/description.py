@@ -133,4 +133,5 @@ class RobotDescription:
             self.base_limits.effort,
             self.meshes,
             self.is_remote,
+            self.base_limits.kind == "free",
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -51,13 +52,19 @@ def _default_home(joint: Joint) -> float:
 
 
 def make_drives(
-    robot: Robot, driven: list[Joint], description: RobotDescription, notes: list[str], assumed: list[str]
+    robot: Robot,
+    driven: list[Joint],
+    description: RobotDescription,
+    feet: Mapping[str, np.ndarray],
+    notes: list[str],
+    assumed: list[str],
 ) -> tuple[Drive, ...]:
     """Returns the drives of the driven joints, with the gains of their groups. Missing gains are derived, which is
     added to ``notes``.
 
     If a drive is too weak for the weight that it carries at home, the joint is assumed to have a counterbalance: the
-    weight is added to the drive's effort, and the joint is added to ``assumed``.
+    weight is added to the drive's effort, and the joint is added to ``assumed``. Drives of legs also carry the robot,
+    which stands on its ``feet`` (see :func:`vinesim.robot.description.extent.feet`).
     """
     gains: dict[str, tuple[float, float]] = {}
     armatures: dict[str, float] = {}
@@ -71,18 +78,26 @@ def make_drives(
             if group.series_stiffness is not None and group.series_damping is not None:
                 springs[joint] = group.series_stiffness[i], group.series_damping[i]
     inertia, weight = _carried_loads(robot, description)
+    standing = _standing_loads(robot, description, feet)
     derived = [joint.name for joint in driven if joint.name not in gains]
     if derived:
         notes.append(f"servo gains of {len(derived)} joints are derived from effort limits and inertia")
     drives = [
         _make_drive(
-            joint, gains.get(joint.name), armatures.get(joint.name), springs.get(joint.name), inertia[joint.name]
+            joint,
+            gains.get(joint.name),
+            armatures.get(joint.name),
+            springs.get(joint.name),
+            inertia[joint.name],
+            standing[joint.name] if standing[joint.name] >= joint_limits(joint).effort else 0.0,
         )
         for joint in driven
     ]
+    limit = {joint.name: joint_limits(joint).effort for joint in driven}
     weak = [i for i, drive in enumerate(drives) if weight[drive.joint] >= drive.effort]
     for i in weak:
         drives[i] = dataclasses.replace(drives[i], effort=drives[i].effort + weight[drives[i].joint])
+    weak = [i for i, drive in enumerate(drives) if drive.effort > limit[drive.joint]]
     if weak:
         assumed.append(f"{some_names([drives[i].joint for i in weak])} is too weak for its weight: counterbalanced")
     return tuple(drives)
@@ -94,10 +109,12 @@ def _make_drive(
     armature: float | None,
     spring: tuple[float, float] | None,
     inertia: float,
+    support: float,
 ) -> Drive:
     """Returns one drive. ``inertia`` [kg m2 or kg]: inertia that the drive carries, from which missing gains are
-    derived with critical damping."""
+    derived with critical damping. ``support`` [N m or N]: effort that is added to the joint's limit."""
     limits = joint_limits(joint)
+    limits = dataclasses.replace(limits, effort=limits.effort + support)
     if armature is None:
         armature = ACCELERATION_TIME * limits.effort / limits.velocity
     if gains is None:
@@ -115,6 +132,27 @@ def _make_drive(
         series_stiffness=spring[0] if spring else 0.0,
         series_damping=spring[1] if spring else 0.0,
     )
+
+
+def _standing_loads(robot: Robot, description: RobotDescription, feet: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Returns the effort [N m or N] of each moving joint that carries the robot, which stands at home with an equal
+    share of its weight on each of its ``feet``."""
+    load = dict.fromkeys(description.moving_joints.names, 0.0)
+    if not feet:
+        return load
+    poses = description.link_poses(description.home)
+    share = STANDARD_GRAVITY * description.mass / len(feet)
+    above = {child: description.link_anchors[parent][0] for parent, child in description.moving_joints.frames}
+    joints = {joint.name: joint for joint in robot.joints}
+    for name, (_, child) in zip(description.moving_joints.names, description.moving_joints.frames, strict=True):
+        axis = frames.rotate(poses[child][3:], joints[name].axis / np.linalg.norm(joints[name].axis))
+        carrying = np.array([place for foot, place in feet.items() if _is_distal(foot, child, above)]).reshape(-1, 3)
+        if joints[name].type == "prismatic":
+            load[name] = share * len(carrying) * abs(float(axis[2]))
+        else:
+            lever = (carrying - poses[child][:3]).sum(axis=0)
+            load[name] = share * abs(float(lever[1] * axis[0] - lever[0] * axis[1]))
+    return load
 
 
 def _carried_loads(robot: Robot, description: RobotDescription) -> tuple[dict[str, float], dict[str, float]]:

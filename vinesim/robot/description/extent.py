@@ -1,8 +1,9 @@
-"""Size of a robot: the box around its shapes in its home pose."""
+"""Size of a robot in its home pose: the boxes around its shapes, and the links on which it stands."""
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 
 import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
@@ -16,13 +17,57 @@ LARGEST = 20.0
 SMALLEST = 0.01
 
 
-def bounds(description: RobotDescription, root: etree._Element) -> np.ndarray | None:
-    """Returns the lower and upper corner [2, 3] m of the box around all shapes of a robot at home, in the frame of its
-    root link; None if it has no shapes. ``root``: XML of the robot, with the ``bounds`` of meshes."""
+STANDING_SHARE = 0.05
+"""Share of a robot's height within which the lowest points of its links count as standing on the ground. GUESSED"""
+LEAST_LEGS = 2
+"""Number of legs from which on a robot counts as legged."""
+
+
+def bounds(boxes: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """Returns the lower and upper corner [2, 3] m of the box around all ``boxes`` of links; None if there are none."""
+    if not boxes:
+        return None
+    every = np.array(list(boxes.values()))
+    return np.array([every[:, 0].min(axis=0), every[:, 1].max(axis=0)])
+
+
+def feet(description: RobotDescription, boxes: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Returns where a robot on legs touches the ground at home [3] m, in the frame of its root link, by moving link;
+    empty for other robots.
+
+    The links that reach lowest are feet if joints move all of them and at least :data:`LEAST_LEGS` do not carry another
+    one. ``boxes``: boxes of its links.
+    """
+    box = bounds(boxes)
+    if box is None:
+        return {}
+    reach = box[0, 2] + STANDING_SHARE * (box[1, 2] - box[0, 2])
+    lowest: dict[str, list[np.ndarray]] = {}
+    for link, corners in boxes.items():
+        if corners[0, 2] <= reach:
+            lowest.setdefault(description.link_anchors[link][0], []).append(corners)
+    above = {child: parent for parent, child in description.moving_joints.frames}
+    carrying = set()
+    for link in lowest:
+        if link not in above:
+            return {}
+        while link in above:
+            link = description.link_anchors[above[link]][0]
+            carrying.add(link)
+    found = {link: np.mean(boxes, axis=(0, 1)) for link, boxes in lowest.items() if link not in carrying}
+    for place in found.values():
+        place[2] = box[0, 2]
+    return found if len(found) >= LEAST_LEGS else {}
+
+
+def link_boxes(description: RobotDescription, root: etree._Element) -> dict[str, np.ndarray]:
+    """Returns the lower and upper corner [2, 3] m of the box around the shapes of each link at home, by link, in the
+    frame of the root link. ``root``: XML of the robot, with the ``bounds`` of meshes."""
     poses = description.link_poses(description.home)
-    points = []
+    found = {}
     for link in root.iterfind("link"):
         pose = poses.get(link.get("name"))
+        points = []
         for shape in (*link.iterfind("visual"), *link.iterfind("collision")):
             corners = _corners(shape)
             if corners is None or pose is None:
@@ -31,10 +76,10 @@ def bounds(description: RobotDescription, root: etree._Element) -> np.ndarray | 
             if origin is not None:
                 corners = corners @ origin[:3, :3].T + origin[:3, 3]
             points.append(pose[:3] + frames.rotate(pose[3:], corners))
-    if not points:
-        return None
-    every = np.concatenate(points)
-    return np.array([every.min(axis=0), every.max(axis=0)])
+        if points:
+            every = np.concatenate(points)
+            found[link.get("name")] = np.array([every.min(axis=0), every.max(axis=0)])
+    return found
 
 
 def size_warning(box: np.ndarray) -> str | None:

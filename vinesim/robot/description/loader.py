@@ -6,7 +6,8 @@
 A robot file of another format is converted to URDF first (:mod:`vinesim.robot.description.source`). ROS receives the
 user's own URDF. Physics receives a changed one: meshes have absolute paths and formats that it reads; wheels and
 casters are fixed, because the base is driven as one body; a root link ``world`` is renamed and bolts the robot
-down; a robot that reaches below its root link is lifted to the ground; missing or invalid values are repaired.
+down; a robot that reaches below its root link is lifted to the ground; missing or invalid values are repaired. A robot
+that stands on legs, and whose file says that it moves freely, gets a free base.
 :attr:`RobotDescription.notes` lists each change. One warning for each robot lists what was assumed.
 """
 
@@ -17,16 +18,18 @@ import dataclasses
 import logging
 import pathlib
 from collections.abc import Container, Mapping, Sequence
+from typing import get_args
 
 import msgspec
 import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
 from vinesim.core import frames
-from vinesim.robot.description.controllers import command_interfaces, make_controllers
+from vinesim.rigid.robot_body import lowest_point
+from vinesim.robot.description.controllers import command_interfaces, make_controllers, with_original_names
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.drive_parameters import home_positions, make_drives
-from vinesim.robot.description.extent import bounds, size_warning
+from vinesim.robot.description.extent import bounds, feet, link_boxes, size_warning
 from vinesim.robot.description.gazebo_sensors import read_sensors
 from vinesim.robot.description.grippers import Fingers, guess_fingers, warn_of_unlisted_fingers
 from vinesim.robot.description.inferred_defaults import SENSOR_GUESSES, guess_groups, guess_imus
@@ -37,17 +40,26 @@ from vinesim.robot.description.packages import ros_address
 from vinesim.robot.description.repairs import (
     MOUNT,
     add_missing_masses,
-    drive_the_base,
+    free_the_base,
     lift_to_ground,
     rename_world,
     repair_inertias,
     repair_joints,
+    some_names,
 )
-from vinesim.robot.description.sidecar import JointGroup, Sidecar, check_sidecar, read_sidecar
+from vinesim.robot.description.sidecar import BaseKind, JointGroup, Sidecar, check_sidecar, read_sidecar
 from vinesim.robot.description.source import RobotSource, read_source
-from vinesim.robot.description.srdf import find_srdf, merge_disabled_collisions, read_srdf, srdf_groups, srdf_hands
+from vinesim.robot.description.srdf import (
+    find_srdf,
+    merge_disabled_collisions,
+    read_srdf,
+    srdf_floats,
+    srdf_groups,
+    srdf_hands,
+)
 from vinesim.robot.description.urdf import (
     MOVABLE_JOINT_TYPES,
+    DescriptionError,
     Joint,
     check_friction,
     check_joints,
@@ -82,6 +94,7 @@ def load_description(
     received: Mapping[str, np.ndarray] | None = None,
     srdf: str | pathlib.Path | None = None,
     xacro_args: Sequence[str] = (),
+    base: str = "auto",
 ) -> RobotDescription:
     """Load a robot description. ``name``: path of a URDF, xacro, SDF or MJCF file, a pipe, ``-`` for the standard
     input, name of a URDF in ``data/robots``, or ``tiago_pro`` (needs the extra ``tiago``).
@@ -89,16 +102,21 @@ def load_description(
     ``is_remote``: whether the URDF was received over the network. Then no file that it names is opened, and its meshes
     are taken from ``received`` (digest -> corners [face, 3, 3] m); other meshes become boxes. ``sidecar``: replaces the
     TOML file. ``srdf``: path of the SRDF, instead of the one beside the file. ``xacro_args``: arguments of a xacro
-    file, each ``NAME:=VALUE``. Raises :class:`DescriptionError`, with one line of text, if the robot cannot be
+    file, each ``NAME:=VALUE``. ``base``: how the base moves, unless ``auto`` instead of what the TOML file says
+    (:attr:`BaseLimits.kind`). Raises :class:`DescriptionError`, with one line of text, if the robot cannot be
     simulated.
     """
+    try:
+        kind = msgspec.convert(base, BaseKind)
+    except msgspec.ValidationError:
+        raise DescriptionError(f"{name}: the base is {base!r}; give {', '.join(get_args(BaseKind))}") from None
     if is_remote:
         file = pathlib.Path(name)
         source = RobotSource(read_xml(file), file, None, {})
     else:
         source = read_source(str(name), parse_arguments(xacro_args))
     loading = _Loading(source, is_remote=is_remote, received=received)
-    description = loading.describe(sidecar, None if srdf is None else pathlib.Path(srdf))
+    description = loading.describe(sidecar, None if srdf is None else pathlib.Path(srdf), kind)
     for note in loading.notes:
         log.info("%s: %s", source.file.name, note)
     if loading.assumed:
@@ -115,11 +133,14 @@ class _Loading:
         self.file = source.file
         self.root = source.root
         self.is_remote = is_remote
+        self.floats = source.floats
         self.notes = list(source.notes)
         self.assumed: list[str] = []
         check_numbers(self.root, self.file)
         self.originals = make_names_valid(self.root, self.assumed)
         renamed = {old: new for new, old in self.originals.items()}
+        if renamed:
+            self.notes.append("replaced names: " + ", ".join(f"{old!r} by {new!r}" for old, new in renamed.items()))
         self.home = {renamed.get(joint, joint): position for joint, position in source.home.items()}
         self.meshes: dict[str, np.ndarray] = {}
         self.ros_urdf = ""
@@ -130,11 +151,12 @@ class _Loading:
             found = resolve_meshes(self.root, self.file, self.assumed)
             self.ros_urdf = ros_text(for_ros, found, None if self.originals else source.text)
 
-    def describe(self, sidecar: Sidecar | None, srdf: pathlib.Path | None) -> RobotDescription:
+    def describe(self, sidecar: Sidecar | None, srdf: pathlib.Path | None, kind: BaseKind) -> RobotDescription:
         """Repair and check the robot, and return its description."""
         root, file, notes, assumed = self.root, self.file, self.notes, self.assumed
-        drive_the_base(root, notes, assumed)
-        fix_wheels(root, notes)
+        root_joint = free_the_base(root, assumed)
+        self.floats |= root_joint == "floating"
+        has_wheels = fix_wheels(root, notes)
         rename_world(root, notes)
         repair_joints(root, assumed)
         repair_inertias(root, assumed)
@@ -147,6 +169,7 @@ class _Loading:
         set_friction(root, sidecar.friction, toml)
         check_friction(root, file)
         groups = self._read_srdf(sidecar, srdf)
+        self.floats |= groups is not None and srdf_floats(groups)
         try:
             parsed = parse_robot(root)
         except ValueError as error:
@@ -159,14 +182,25 @@ class _Loading:
         add_missing_masses(root, parsed, base, order, assumed)
         assembly = _Assembly(file, toml, sidecar, sensors, groups, self.home, is_remote=self.is_remote)
         made = assembly.description(root)
-        box = None if self.is_remote else bounds(made[0], root)
+        boxes = {} if self.is_remote else link_boxes(made[0], root)
+        standing = feet(made[0], boxes) if root.find("link/collision") is not None else {}
+        kind = self._base_kind(sidecar.base.kind if kind == "auto" else kind, made[0].base, standing, has_wheels)
+        if root_joint and kind != "free":
+            notes.append(f"its base moves on a {root_joint} joint: {'bolted down' if kind == 'fixed' else 'driven'}")
+        assembly = assembly.with_base(kind, standing)
+        made = assembly.description(root)
+        box = bounds(boxes)
         if box is None and not self.is_remote:
             notes.append("it has no shapes: it is invisible, and touches nothing")
         if box is not None:
-            if (warning := size_warning(box)) is not None:
+            warning = size_warning(box)
+            if warning is not None:
                 assumed.append(warning)
-            elif base not in (MOUNT, "base_footprint") and box[0, 2] < -LEAST_LIFT:
-                lift_to_ground(root, base, -float(box[0, 2]), notes)
+            lift = -float(box[0, 2]) if base not in (MOUNT, "base_footprint") and box[0, 2] < -LEAST_LIFT else 0.0
+            if kind == "free":
+                lift = self._height_on_feet(made[0])
+            if lift and warning is None:
+                lift_to_ground(root, base, lift, notes)
                 made = assembly.description(root)
         description, more_notes, more_assumed = made
         notes += more_notes
@@ -178,7 +212,39 @@ class _Loading:
             is_remote=self.is_remote,
             ros_urdf=self.ros_urdf,
             original_names=self.originals,
+            controllers=with_original_names(description.controllers, self.originals),
         )
+
+    def _base_kind(self, wanted: BaseKind, base: str, standing: Mapping[str, np.ndarray], has_wheels: bool) -> BaseKind:
+        """Returns how the base moves: as ``wanted``, else as the file says. ``base``: the root link. ``standing``: see
+        :func:`feet`."""
+        if base == MOUNT:
+            if wanted in ("planar", "free"):
+                found = f"a fixed joint bolts it down to 'world', so its base cannot be {wanted}"
+                raise description_error(self.file, found, "remove the link 'world', or choose the base 'fixed'")
+            return "fixed"
+        if wanted == "free" and has_wheels:
+            self.assumed.append("its wheels do not turn: it stands on them and cannot drive")
+        if wanted != "auto":
+            return wanted
+        if standing and self.floats and not has_wheels:
+            self.notes.append(f"its base is free: it stands on {some_names(list(standing))}")
+            return "free"
+        if standing and not has_wheels:
+            self.assumed.append(
+                f"its base is driven in the plane, although it stands on legs, {some_names(list(standing))}: "
+                "with --base free, or kind = 'free' in [base] of its TOML file, the legs carry it"
+            )
+        return "planar"
+
+    def _height_on_feet(self, described: RobotDescription) -> float:
+        """Returns the height [m] of the root link of a robot that stands at home. Raises :class:`DescriptionError` if
+        it would fall through the ground."""
+        lowest = lowest_point(described.to_spec("robot"))
+        if lowest is None:
+            found = "nothing of it collides, so that a free base would fall through the ground"
+            raise description_error(self.file, found, "give its links <collision> shapes, or choose the base 'planar'")
+        return -lowest
 
     def _with_sensors(self, sidecar: Sidecar) -> tuple[Sidecar, tuple[RenderedMount, ...]]:
         """Returns the TOML file's content with the robot's IMUs, and the robot's rendered sensors.
@@ -253,6 +319,16 @@ class _Assembly:
     home: Mapping[str, float]
     """Home positions [rad or m] that the robot file gives, by joint."""
     is_remote: bool
+    feet: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    """Where the feet touch the ground [3] m, by moving link; empty unless the base is free."""
+
+    def with_base(self, kind: BaseKind, feet: Mapping[str, np.ndarray]) -> _Assembly:
+        """Returns the same with another kind of base. ``feet``: on which the robot stands if its base is free."""
+        base = msgspec.structs.replace(self.sidecar.base, kind=kind)
+        if kind == "fixed":
+            base = msgspec.structs.replace(base, linear=0.0, angular=0.0, effort=BOLTED_EFFORT)
+        sidecar = msgspec.structs.replace(self.sidecar, base=base)
+        return dataclasses.replace(self, sidecar=sidecar, feet=feet if kind == "free" else {})
 
     def description(self, root: etree._Element) -> tuple[RobotDescription, list[str], list[str]]:
         """Returns the description of the robot in ``root``, which was checked, with notes and warnings."""
@@ -297,13 +373,11 @@ class _Assembly:
             wrenches=sidecar.wrenches,
             grippers=sidecar.all_grippers,
             controllers=make_controllers(sidecar, names, command_interfaces(urdf), self.toml),
-            base_limits=msgspec.structs.replace(sidecar.base, linear=0.0, angular=0.0, effort=BOLTED_EFFORT)
-            if base == MOUNT
-            else sidecar.base,
+            base_limits=sidecar.base,
             mass=sum(link.inertial.mass or 0.0 for link in robot.links if link.inertial is not None),
             notes=(),
         )
-        drives = make_drives(robot, driven, description, notes, assumed)
+        drives = make_drives(robot, driven, description, self.feet, notes, assumed)
         return dataclasses.replace(description, drives=drives), notes, assumed
 
     def _grouped(self, names: list[str], anchors: Container[str], order: list[Joint]) -> Sidecar:

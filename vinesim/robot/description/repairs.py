@@ -37,11 +37,13 @@ LEAST_MOMENT_SHARE = 1e-3
 """Share of the largest principal moment to which principal moments with a rounding error are raised."""
 
 
-def drive_the_base(root: etree._Element, notes: list[str], assumed: list[str]) -> None:
-    """Remove the floating or planar joint at the root of a robot, and the link above it (``world``): the base is
-    driven. Floating and planar joints elsewhere become fixed. Adds this to ``notes`` or ``assumed``."""
+def free_the_base(root: etree._Element, assumed: list[str]) -> str:
+    """Remove the floating or planar joint at the root of a robot, and the link above it (``world``). Floating and
+    planar joints elsewhere become fixed, which is added to ``assumed``. Returns the type of the joint at the root;
+    empty if there is none."""
     children = {joint.find("child").get("link") for joint in root.iterfind("joint") if joint.find("child") is not None}
     fixed = []
+    found = ""
     for joint in root.findall("joint"):
         if joint.get("type") not in ("floating", "planar"):
             continue
@@ -53,12 +55,13 @@ def drive_the_base(root: etree._Element, notes: list[str], assumed: list[str]) -
         if above not in children and len(beside) == 1 and (is_bare or above == "world"):
             root.remove(joint)
             root.remove(links[0])
-            notes.append(f"its base moves on a {joint.get('type')} joint: it is driven in the plane")
+            found = joint.get("type")
         else:
             fix_joint(joint)
             fixed.append(joint.get("name", ""))
     if fixed:
         assumed.append(f"{some_names(fixed)} is floating or planar, but not at the root: fixed")
+    return found
 
 
 def lift_to_ground(root: etree._Element, base: str, height: float, notes: list[str]) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import pathlib
 from collections.abc import Container, Iterable, Sequence
-from typing import cast
+from typing import Literal, cast
 
 import msgspec
 import numpy as np
@@ -18,10 +18,16 @@ from vinesim.robot.description.grippers import AnyGripper, Cutter
 from vinesim.robot.description.urdf import description_error
 from vinesim.scene.values import SENSOR_KINDS, ImuMount, RenderedMount, SensorMode, SensorMount, SensorPacing
 
+BaseKind = Literal["auto", "planar", "free", "fixed"]
+"""How the base of a robot moves, see :attr:`BaseLimits.kind`."""
+
 
 class BaseLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Limits of the motion of the base."""
 
+    kind: BaseKind = "auto"
+    """How the base moves. ``planar``: it is driven in the plane. ``free``: it moves freely, and the robot stands on its
+    legs. ``fixed``: it is bolted down. ``auto``: as the robot file says."""
     linear: float = 0.5
     """Largest speed [m/s]."""
     angular: float = 0.8
@@ -184,7 +190,7 @@ def decode_sidecar(text: str) -> Sidecar:
     except (msgspec.DecodeError, msgspec.ValidationError, RecursionError) as error:
         raise description_error(origin, str(error), "use the same release of vinesim") from error
     arrays = {name: values for group in found.groups.values() for name, values in group.arrays().items() if values}
-    limits = msgspec.structs.asdict(found.base)
+    limits = {key: value for key, value in msgspec.structs.asdict(found.base).items() if key != "kind"}
     for name, values in (*arrays.items(), *((key, np.atleast_1d(value)) for key, value in limits.items())):
         least = -MAX_REMOTE_NUMBER if name == "home" else 0.0
         if not all(least <= number <= MAX_REMOTE_NUMBER for number in values):

@@ -47,6 +47,8 @@ class RobotSource:
     home: Mapping[str, float]
     """Home positions [rad or m] of joints, where the file gives them."""
     notes: tuple[str, ...] = ()
+    floats: bool = False
+    """Whether its format has models that move freely unless they are fixed, and nothing fixes this one."""
 
 
 def is_shipped(name: str) -> bool:
@@ -89,7 +91,8 @@ def read_source(name: str, arguments: Mapping[str, str]) -> RobotSource:
         return _from_mjcf(content, file)
     if root.tag in ("sdf", "gazebo", "world", "model"):
         found, notes = urdf_of_sdf(root, file)
-        return dataclasses.replace(_named(found, file, None), notes=notes)
+        floats = found.find("link[@name='world']") is None
+        return dataclasses.replace(_named(found, file, None), notes=notes, floats=floats)
     raise description_error(
         file, f"its root is <{root.tag}>, not <robot>", "give a URDF, xacro, SDF or MJCF file of a robot"
     )

@@ -64,6 +64,11 @@ def merge_disabled_collisions(root: etree._Element, srdf: etree._Element, name: 
     notes.append(f"{len(known)} pairs of links never touch by {name}{unknown}")
 
 
+def srdf_floats(srdf: etree._Element) -> bool:
+    """Returns whether an SRDF says that its robot moves freely in the world."""
+    return any(joint.get("type") == "floating" for joint in srdf.iterfind("virtual_joint"))
+
+
 def srdf_hands(srdf: etree._Element) -> tuple[str, ...]:
     """Returns the names of the groups of an SRDF that are end effectors."""
     return tuple(effector.get("group", "") for effector in srdf.iterfind("end_effector"))
@@ -72,7 +77,8 @@ def srdf_hands(srdf: etree._Element) -> tuple[str, ...]:
 def srdf_groups(srdf: etree._Element, order: Collection[Joint], driven: Collection[str]) -> dict[str, JointGroup]:
     """Returns the joint groups of an SRDF that have driven joints, each joint in one group.
 
-    A group that consists of other groups, or has a joint of a smaller group, is left out. ``order``: joints of the
+    A group that consists of other groups, or has a joint of a smaller group, is left out. The home pose of a group is
+    its own state, else that of another group with all its joints, such as the whole body. ``order``: joints of the
     robot. ``driven``: names of its driven joints.
     """
     elements = {group.get("name", ""): group for group in srdf.iterfind("group")}
@@ -93,11 +99,12 @@ def srdf_groups(srdf: etree._Element, order: Collection[Joint], driven: Collecti
         taken |= joints[name]
         ordered = tuple(sorted(joints[name], key=lambda joint: rank[joint]))
         tip = next((chain.get("tip_link", "") for chain in elements[name].iterfind("chain")), tools.get(name, ""))
-        state = next((states[name, pose] for pose in HOME_STATES if (name, pose) in states), None)
+        own = [states[name, pose] for pose in HOME_STATES if (name, pose) in states]
+        larger = [state for pose in HOME_STATES for (_, one), state in states.items() if one == pose]
+        homes = (_home(state, ordered) for state in (*own, *larger))
+        home = next((home for home in homes if home is not None), None)
         is_hand = name in hands
-        groups[name] = JointGroup(
-            joints=ordered, tool=tip if tip in links and not is_hand else "", home=_home(state, ordered)
-        )
+        groups[name] = JointGroup(joints=ordered, tool=tip if tip in links and not is_hand else "", home=home)
     return {name: groups[name] for name in elements if name in groups}
 
 
@@ -127,10 +134,8 @@ def _joints(
     return found.intersection(driven)
 
 
-def _home(state: etree._Element | None, joints: tuple[str, ...]) -> tuple[float, ...] | None:
+def _home(state: etree._Element, joints: tuple[str, ...]) -> tuple[float, ...] | None:
     """Returns the positions [rad or m] of a group state; None if it does not give one for each of ``joints``."""
-    if state is None:
-        return None
     try:
         given = {one.get("name"): float(one.get("value", "").split()[0]) for one in state.iterfind("joint")}
     except (ValueError, IndexError):

@@ -183,8 +183,9 @@ def check_numbers(root: etree._Element, file: pathlib.Path) -> None:
                 raise description_error(file, f"{where} is not a size", "give numbers above 0")
 
 
-def fix_wheels(root: etree._Element, notes: list[str]) -> None:
-    """Make the joints of wheels and casters fixed, because the base is driven as one body. Adds this to ``notes``."""
+def fix_wheels(root: etree._Element, notes: list[str]) -> bool:
+    """Make the joints of wheels and casters fixed, because the base is driven as one body. Adds this to ``notes``.
+    Returns whether there are any."""
     wheels = [
         joint
         for joint in root.iterfind("joint")
@@ -194,6 +195,7 @@ def fix_wheels(root: etree._Element, notes: list[str]) -> None:
         fix_joint(joint)
     if wheels:
         notes.append(f"{len(wheels)} wheel and caster joints are fixed: the base is driven as a whole")
+    return bool(wheels)
 
 
 def fix_joint(joint: etree._Element) -> None:

@@ -50,6 +50,11 @@ class Robot(RobotInstance):
         """
         super().__init__(rigid, description, name, index, pose)
         self._joint_index = {drive.joint: i for i, drive in enumerate(description.drives)}
+        self._joint_index |= {
+            description.original_names[joint]: i
+            for joint, i in self._joint_index.items()
+            if joint in description.original_names
+        }
         self._cutters: dict[str, list[Blade]] = {}
         self._physics: Physics | None = None
         self._body_sensors = BodySensors(rigid, self.name, description)
@@ -108,7 +113,8 @@ class Robot(RobotInstance):
     # ------------------------------------------------------------------ commands
 
     def joint_indices(self, joints: Joints) -> np.ndarray:
-        """Returns the indices of joints in joint arrays. Raises :class:`CommandError` for a joint without a drive."""
+        """Returns the indices of joints in joint arrays. Raises :class:`CommandError` for a joint without a
+        drive. Names may be those of the robot file, too."""
         if joints is None:
             return np.arange(len(self.setpoint))
         if isinstance(joints, np.ndarray):
@@ -116,7 +122,7 @@ class Robot(RobotInstance):
         try:
             return np.array([self._joint_index[joint] for joint in joints], int)
         except KeyError as error:
-            known = ", ".join(self._joint_index)
+            known = ", ".join(self.description.joints)
             raise CommandError(f"{self.name} has no drive for {error.args[0]!r}; it drives: {known}") from None
 
     def command_position(self, position: Values, joints: Joints = None) -> None:
@@ -204,6 +210,8 @@ class Robot(RobotInstance):
         if not np.isfinite([linear, angular]).all():
             raise CommandError(f"{self.name}: base velocity ({linear}, {angular}) is not finite")
         limits = self.description.base_limits
+        if limits.kind == "free":
+            raise CommandError(f"{self.name} stands on its legs: it has no wheels to drive; command its joints")
         self._base_goal = _clamp(linear, limits.linear), _clamp(angular, limits.angular)
         self._base_time = time
 
@@ -242,6 +250,8 @@ class Robot(RobotInstance):
     def _drive_base(self, time: float) -> None:
         """Accelerate the base towards its commanded velocity, or to a stop if the last command is too old."""
         limits = self.description.base_limits
+        if limits.kind == "free":
+            return
         linear_goal, angular_goal = self._base_goal if time - self._base_time <= limits.timeout else (0.0, 0.0)
         linear, angular = self._base_velocity
         linear += _clamp(linear_goal - linear, self.rigid.dt * limits.linear_acceleration)

@@ -50,6 +50,7 @@ class RobotInstance:
         """State of the indicator lights."""
         self._shown_color: Color | None = None
         # on uneven ground the base stands lower or higher than given, and tilted
+        self._is_free = description.base_limits.kind == "free"
         start = spec.pose if rigid.model.terrain is None else rigid.base_state(self.name)[0]
         back = frames.conjugate(start[3:])
         self._start = start[:3].copy()
@@ -88,7 +89,7 @@ class RobotInstance:
         position, velocity, effort, contact = self.rigid.joint_measurements(self.name)
         base_q, base_qd = self.rigid.base_state(self.name)
         odom_q = self._odometry(base_q)
-        odom_qd = self._track_odometry.velocity(base_q, base_qd)
+        odom_qd = self._odometry_velocity(base_q, base_qd)
         return RobotSample(
             actor=self.name,
             joints=JointSample(time, self._joint_names, position, velocity, effort, contact),
@@ -100,6 +101,7 @@ class RobotInstance:
             transforms=self.description.moving_joints.frames,
             transform_q=_NO_POSES,
             contacts=self._own(contacts),
+            odom_is_spatial=self._is_free,
             **more,
         )
 
@@ -114,9 +116,16 @@ class RobotInstance:
     def _odometry(self, base_q: np.ndarray) -> np.ndarray:
         """Returns the pose [7] of the base since the start as odometry measures it. It is exact, unless the tracks
         slip."""
-        if self._tracks_slip:
+        if self._tracks_slip and not self._is_free:
             return self._track_odometry.update(base_q)
         return np.concatenate([self._start_turn @ (base_q[:3] - self._start), self._start_left @ base_q[3:]])
+
+    def _odometry_velocity(self, base_q: np.ndarray, base_qd: np.ndarray) -> np.ndarray:
+        """Returns the velocity [6] by odometry, in the axes of the base: that of the tracks; on legs it is exact."""
+        if not self._is_free:
+            return self._track_odometry.velocity(base_q, base_qd)
+        back = frames.conjugate(base_q[3:])
+        return np.concatenate([frames.rotate(back, base_qd[:3]), frames.rotate(back, base_qd[3:])])
 
 
 class RemoteRobot(RobotInstance):
@@ -146,9 +155,9 @@ class RemoteRobot(RobotInstance):
 
     def _teleport(self, update: RobotUpdate, here: np.ndarray) -> None:
         """Place the copy at the state of ``update``. ``here`` [7]: present pose of its base."""
-        is_level = self.rigid.model.terrain is None
+        is_planar = self.rigid.model.terrain is None and not self._is_free
         if (
-            is_level and abs(update.base_q[2] - here[2]) > 1e-3
+            is_planar and abs(update.base_q[2] - here[2]) > 1e-3
         ):  # the base joint is planar, so another height needs a new body
             self.rigid.remove_robot(self.name)
             self._shown_color = None

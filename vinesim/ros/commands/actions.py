@@ -71,7 +71,7 @@ class ControllerActions:
         self._gripper_type = GripperCommand
         for spec in controllers:
             if spec.kind is ControllerKind.JOINT_TRAJECTORY:
-                take = partial(convert.trajectory_goal, controller=spec.name, known=spec.joints)
+                take = partial(convert.trajectory_goal, controller=spec.name, known=spec.joints, renamed=spec.renamed)
                 self._serve(node, FollowJointTrajectory, f"{spec.name}/follow_joint_trajectory", take)
             elif spec.kind is ControllerKind.GRIPPER:
                 take = partial(convert.gripper_goal, controller=spec.name)

@@ -3,7 +3,7 @@ messages."""
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -110,11 +110,16 @@ def elastic_command(message: JointState, controller: str, joint: str) -> Elastic
 
 
 def hardware_command(
-    message: JointState, controller: str, joints: Sequence[str], mimics: Container[str]
+    message: JointState,
+    controller: str,
+    joints: Sequence[str],
+    mimics: Container[str],
+    renamed: Mapping[str, str] = {},
 ) -> HardwareCommand:
     """Convert commands for some of ``joints``. Each of position, velocity and effort is empty, or has one value for
-    each name, NaN for none. Names in ``mimics``, of joints that follow others, are left out."""
-    names = list(message.name)
+    each name, NaN for none. Names in ``mimics``, of joints that follow others, are left out. ``renamed``: see
+    :attr:`ControllerSpec.renamed`."""
+    names = [renamed.get(name, name) for name in message.name]
     unknown = [name for name in names if name not in joints and name not in mimics]
     if unknown or len(set(names)) < len(names):
         found = f"commands for {', '.join(unknown) or 'a joint twice'}"
@@ -135,11 +140,15 @@ def hardware_command(
 
 
 def joint_trajectory(
-    message: JointTrajectoryMessage, controller: str, known: Sequence[str], goal: bytes | None = None
+    message: JointTrajectoryMessage,
+    controller: str,
+    known: Sequence[str],
+    goal: bytes | None = None,
+    renamed: Mapping[str, str] = {},
 ) -> JointTrajectory:
     """Convert a trajectory for some of the ``known`` joints of a controller. Each point must have one position per
-    joint, and the times must increase from 0."""
-    joints = tuple(message.joint_names)
+    joint, and the times must increase from 0. ``renamed``: see :attr:`ControllerSpec.renamed`."""
+    joints = tuple(renamed.get(joint, joint) for joint in message.joint_names)
     unknown = [joint for joint in joints if joint not in known]
     if unknown or len(set(joints)) < len(joints) or (message.points and not joints):
         raise CommandError(
@@ -164,10 +173,12 @@ def joint_trajectory(
     return JointTrajectory(controller, seconds(message.header.stamp), joints, times, positions, velocities, goal=goal)
 
 
-def trajectory_goal(request: Any, controller: str, known: Sequence[str], goal: bytes) -> JointTrajectory:
+def trajectory_goal(
+    request: Any, controller: str, known: Sequence[str], goal: bytes, renamed: Mapping[str, str] = {}
+) -> JointTrajectory:
     """Convert a goal of control_msgs/action/FollowJointTrajectory with its tolerances. Its trajectory must have at
-    least one point."""
-    plain = joint_trajectory(request.trajectory, controller, known, goal)
+    least one point. ``renamed``: see :attr:`ControllerSpec.renamed`."""
+    plain = joint_trajectory(request.trajectory, controller, known, goal, renamed)
     if len(plain.times) == 0:
         raise CommandError(f"{controller}: a goal without points; give at least one, or cancel the previous goal")
     late = request.goal_time_tolerance.sec + 1e-9 * request.goal_time_tolerance.nanosec
@@ -178,23 +189,26 @@ def trajectory_goal(request: Any, controller: str, known: Sequence[str], goal: b
         plain.times,
         plain.positions,
         plain.velocities,
-        path_tolerance=_tolerances(request.path_tolerance, plain.joints, controller),
-        goal_tolerance=_tolerances(request.goal_tolerance, plain.joints, controller),
+        path_tolerance=_tolerances(request.path_tolerance, plain.joints, controller, renamed),
+        goal_tolerance=_tolerances(request.goal_tolerance, plain.joints, controller, renamed),
         goal_time_tolerance=late if late > 0.0 else None,
         goal=goal,
     )
 
 
-def _tolerances(given: Iterable[Any], joints: tuple[str, ...], controller: str) -> JointTolerances | None:
+def _tolerances(
+    given: Iterable[Any], joints: tuple[str, ...], controller: str, renamed: Mapping[str, str]
+) -> JointTolerances | None:
     """Returns tolerances in the order of ``joints``, or None if none is given. In ``given``, 0 means not specified
     and a negative value means unlimited."""
     position = np.full(len(joints), np.inf)
     velocity = np.full(len(joints), np.inf)
     said = False
     for one in given:
-        if one.name not in joints:
+        name = renamed.get(one.name, one.name)
+        if name not in joints:
             raise CommandError(f"{controller}: a tolerance for {one.name!r}, which the trajectory does not move")
-        place = joints.index(one.name)
+        place = joints.index(name)
         for values, limit in ((position, one.position), (velocity, one.velocity)):
             if np.isnan(limit):
                 raise CommandError(f"{controller}: the tolerance for {one.name!r} is not a number")

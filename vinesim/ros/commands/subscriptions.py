@@ -123,14 +123,21 @@ class CommandSubscriptions:
         self._subscribe(audio_data, "speaker/audio", convert.loudspeaker_sound)
         for spec in controllers:
             if spec.hardware is None:
-                self._subscribe_controller(spec.name, spec.kind, spec.joints)
+                self._subscribe_controller(spec)
             else:
-                take = partial(convert.hardware_command, controller=spec.name, joints=spec.joints, mimics=self._mimics)
+                take = partial(
+                    convert.hardware_command,
+                    controller=spec.name,
+                    joints=spec.joints,
+                    mimics=self._mimics,
+                    renamed=spec.renamed,
+                )
                 self._subscribe(JointState, spec.hardware.commands, take)
 
-    def _subscribe_controller(self, name: str, kind: ControllerKind, joints: tuple[str, ...]) -> None:
+    def _subscribe_controller(self, spec: ControllerSpec) -> None:
+        name, kind, joints = spec.name, spec.kind, spec.joints
         if kind is ControllerKind.JOINT_TRAJECTORY:
-            take = partial(convert.joint_trajectory, controller=name, known=joints)
+            take = partial(convert.joint_trajectory, controller=name, known=joints, renamed=spec.renamed)
             self._subscribe(JointTrajectoryMessage, f"{name}/joint_trajectory", take)
         elif kind in FORWARD_KINDS:
             take = partial(convert.forward_command, controller=name, joints=joints)

@@ -131,7 +131,8 @@ def odometry(sample: RobotSample, base: str, odom: str) -> Odometry:
     set_vector(message.twist.twist.linear, sample.odom_qd[:3])
     set_vector(message.twist.twist.angular, sample.odom_qd[3:])
     for target, planar in zip((message.pose, message.twist), sample.odom_covariance, strict=True):
-        covariance = np.diag([0.0, 0.0, UNMEASURED, UNMEASURED, UNMEASURED, 0.0])
+        rest = planar[0, 0] if sample.odom_is_spatial else UNMEASURED
+        covariance = np.diag([0.0, 0.0, rest, rest, rest, 0.0])
         covariance[np.ix_(_PLANAR, _PLANAR)] = planar
         target.covariance = covariance.ravel()
     return message

@@ -67,6 +67,8 @@ class RobotSpec:
     """Whether the robot is a copy of a robot that another client simulates. The links of a copy do not collide with
     each other and the ground: the received states already include these contacts, and the boxes that replace meshes in
     a copy would collide wrongly."""
+    has_free_base: bool = False
+    """Whether the base moves freely and the robot stands on its legs. Otherwise the base is driven, or bolted down."""
 
 
 class ControllerKind(enum.StrEnum):
@@ -112,6 +114,9 @@ class ControllerSpec:
     """Name of the joint group of the gripper; empty if the controller does not control a gripper."""
     gripper: str = ""
     """Kind of the gripper, see :mod:`vinesim.robot.description.grippers`; empty for other controllers."""
+    renamed: Mapping[str, str] = dataclasses.field(default_factory=dict, compare=False)
+    """Names of joints by those that they have in the robot file, where these are not valid in ROS. Commands may use
+    either."""
     hardware: HardwareTopics | None = None
     """Topics of a controller of the kind ``topic_based``; None for other controllers."""
 
@@ -234,3 +239,5 @@ class RobotSample:
     wrenches: tuple[Wrench, ...] = ()
     imus: tuple[Imu, ...] = ()
     reference: JointReference | None = None
+    odom_is_spatial: bool = False
+    """Whether odometry measures z, roll and pitch too, as exactly as x: the robot stands on legs."""
