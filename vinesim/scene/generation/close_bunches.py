@@ -114,7 +114,7 @@ def hang_bunches(
             level = flat_up[i, 0] * level + flat_up[i, 1] * level[:, [1, 0, 2]] * [-1.0, 1.0, 0.0]
             way = np.repeat(slant, _DIRECTIONS)[:, None] * np.tile(level, (_SLANTS, 1)) - [0.0, 0.0, 1.0]
             middle = flat_peduncle[i, 0] + frames.normalize(way) * piece[i, 0]
-            way = 0.3 * (way + [0.0, 0.0, 1.0]) - [0.0, 0.0, 1.0]
+            way = 0.6 * (way + [0.0, 0.0, 1.0]) - [0.0, 0.0, 1.0]
             top = middle + frames.normalize(way) * piece[i, 1]
             free = (np.abs(top[:, :2] - foot) + radius[i] + gap < half).all(-1)
             if kept:
