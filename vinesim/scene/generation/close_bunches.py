@@ -25,6 +25,8 @@ _SLANTS = 5
 """Number of slants of the stalk that are tried in each direction."""
 _STEP = 0.01
 """[m] Distance of the points at which wood is tested."""
+_LOWER_SLANT = 0.6
+"""Slant of the lower half of a stalk, as a share of that of the upper half: GUESSED."""
 _LEVELS = (np.arange(25) + 0.5) / 25.0
 """Places along a bunch's axis, as shares of its length, at which its hull is tested against those of other bunches."""
 
@@ -80,66 +82,115 @@ def hang_bunches(
     gap = parameters.bunch.gap.value
     hard = 1.0 - parameters.bunch.press.value
     low, high = scene.fruit.bunches
-    vines = len(structure.foot)
-    slots = len(burden) * MAX_BUNCHES // vines
+    per_vine = len(burden) * MAX_BUNCHES // len(structure.foot)
     fixed = with_old_wood(scene, structure, canes.points[:, 0]).fixed
     half = 0.5 * np.array([scene.layout.vine_spacing, scene.layout.row_spacing])
-    piece = np.linalg.norm(np.diff(peduncle, axis=2), axis=-1).reshape(-1, PEDUNCLE_SEGMENTS)
-    peduncle = peduncle.copy()
-    up = up.copy()
-    chosen = np.zeros(burden.shape, bool)
-    flat_peduncle = peduncle.reshape(-1, PEDUNCLE_SEGMENTS + 1, 3)
-    flat_up, flat_axis = up.reshape(-1, 3), axis.reshape(-1, 3)
-    flat_chosen, load = chosen.reshape(-1), burden.reshape(-1)
-    length, radius, stalk = (fruit[name].reshape(-1) for name in ("length", "radius", "thick"))
-    slant = parameters.peduncle.slant.at(np.linspace(0.0, 1.0, _SLANTS))
-    turn = 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+    slants = parameters.peduncle.slant.at(np.linspace(0.0, 1.0, _SLANTS))
+    chosen = np.zeros(burden.size, bool)
+    line, out = peduncle.reshape(-1, PEDUNCLE_SEGMENTS + 1, 3).copy(), up.reshape(-1, 3).copy()
+    load = burden.ravel()
+    length, radius, thick = (fruit[name].ravel() for name in ("length", "radius", "thick"))
+    hulls = _Hulls(line[:, -1], axis.reshape(-1, 3), length, radius)  # a view: hulls move with the ends of the stalks
     for vine, g in enumerate(structure.rngs):
         foot = structure.foot[vine, :2]
         wanted = int(g.integers(low, high + 1))
         # the first bunch of a shoot is more likely to be kept than the second
-        order = np.argsort(g.random(slots) + 0.45 * (np.arange(slots) % MAX_BUNCHES), kind="stable")
-        wood, thin = _wood_of(vine, structure, fixed, canes, half)
+        order = np.argsort(g.random(per_vine) + 0.45 * (np.arange(per_vine) % MAX_BUNCHES), kind="stable")
+        old, thin = _wood_of(vine, structure, fixed, canes, half)
         kept: list[int] = []
-        carried = np.zeros(slots // MAX_BUNCHES)
-        for number in order:
-            i = vine * slots + int(number)
+        carried = np.zeros(per_vine // MAX_BUNCHES)
+        for number in order.tolist():
+            one = vine * per_vine + number
             shoot = number // MAX_BUNCHES
             if len(kept) == wanted:
                 break
-            if carried[shoot] + load[i] >= MAX_BUCKLING_LOAD:
+            if carried[shoot] + load[one] >= MAX_BUCKLING_LOAD:
                 continue
-            # places: all directions on the smallest slant, then on the next
-            level = np.stack([np.cos(turn), np.sin(turn), 0.0 * turn], -1)
-            level = flat_up[i, 0] * level + flat_up[i, 1] * level[:, [1, 0, 2]] * [-1.0, 1.0, 0.0]
-            way = np.repeat(slant, _DIRECTIONS)[:, None] * np.tile(level, (_SLANTS, 1)) - [0.0, 0.0, 1.0]
-            middle = flat_peduncle[i, 0] + frames.normalize(way) * piece[i, 0]
-            way = 0.6 * (way + [0.0, 0.0, 1.0]) - [0.0, 0.0, 1.0]
-            top = middle + frames.normalize(way) * piece[i, 1]
-            free = (np.abs(top[:, :2] - foot) + radius[i] + gap < half).all(-1)
-            if kept:
-                free &= _clear_of_bunches(top, flat_axis[i], length[i], radius[i], gap, kept, flat_peduncle[:, -1],
-                                          flat_axis, length, radius)
-            for place in np.flatnonzero(free):
-                stalk_points = _along(np.stack([flat_peduncle[i, 0], middle[place], top[place]]))
-                hull = top[place], flat_axis[i], length[i], radius[i]
+            lines, levels = _places(line[one], out[one], slants)
+            inside = (np.abs(lines[:, -1, :2] - foot) + radius[one] + gap < half).all(-1)
+            for place in np.flatnonzero(inside & hulls.apart(one, lines[:, -1], kept, gap)):
+                stalk = _points_along(lines[place], thick[one])
+                hull = hulls.at(one, lines[place, -1])
                 if (
-                    _outside(*wood, *hull, gap)
-                    and _outside(*thin, *hull, gap, hard)
-                    and all(
-                        _outside(stalk_points, stalk[i], flat_peduncle[k, -1], flat_axis[k], length[k], radius[k], gap, hard)
-                        for k in kept
-                    )
+                    _outside(hull, old, gap)
+                    and _outside(hull, thin, gap, hard)
+                    and all(_outside(hulls.at(k, line[k, -1]), stalk, gap, hard) for k in kept)
                 ):
-                    flat_peduncle[i, 1:] = middle[place], top[place]
-                    flat_up[i] = np.tile(level, (_SLANTS, 1))[place]
-                    flat_chosen[i] = True
-                    kept.append(i)
-                    carried[shoot] += load[i]
-                    new = stalk_points, np.full(len(stalk_points), stalk[i])
-                    thin = np.concatenate([thin[0], new[0]]), np.concatenate([thin[1], new[1]])
+                    line[one], out[one] = lines[place], levels[place]
+                    chosen[one] = True
+                    kept.append(one)
+                    carried[shoot] += load[one]
+                    thin = np.concatenate([thin[0], stalk[0]]), np.concatenate([thin[1], stalk[1]])
                     break
-    return chosen, peduncle, up
+    return chosen.reshape(burden.shape), line.reshape(peduncle.shape), out.reshape(up.shape)
+
+
+def _places(line: np.ndarray, up: np.ndarray, slants: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns places at which a bunch may hang, as stalks [place, PEDUNCLE_SEGMENTS + 1, 3] m and the horizontal
+    directions [place, 3] to which they tilt: all directions on the smallest slant, then on the next.
+
+    ``line`` [PEDUNCLE_SEGMENTS + 1, 3] m: the stalk whose start and lengths are used; ``up`` [3]: the first direction.
+    """
+    turn = np.tile(2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS, _SLANTS)
+    level = np.cos(turn)[:, None] * up + np.sin(turn)[:, None] * frames.cross(np.array([0.0, 0.0, 1.0]), up)
+    tilt = np.repeat(slants, _DIRECTIONS)[:, None] * level
+    upper, lower = np.linalg.norm(np.diff(line, axis=0), axis=-1)
+    middle = line[0] + upper * frames.normalize(tilt - [0.0, 0.0, 1.0])
+    end = middle + lower * frames.normalize(_LOWER_SLANT * tilt - [0.0, 0.0, 1.0])
+    return np.stack([np.broadcast_to(line[0], end.shape), middle, end], 1), level
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Hulls:
+    """Spheroids around all bunches."""
+
+    top: np.ndarray
+    """[bunch, 3] m, where the stalk ends."""
+    axis: np.ndarray
+    """[bunch, 3] direction from there to the tip."""
+    length: np.ndarray
+    radius: np.ndarray
+    """[bunch] m"""
+
+    def at(self, one: int, top: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, float]:
+        """Returns middle [3] m, direction [3], half length and radius m of a bunch that hangs at ``top`` [3] m."""
+        half = 0.5 * float(self.length[one])
+        return top + half * self.axis[one], self.axis[one], half, float(self.radius[one])
+
+    def apart(self, one: int, tops: np.ndarray, others: list[int], gap: float) -> np.ndarray:
+        """Returns for each place ``tops`` [place, 3] m of a bunch whether its hull keeps the gap [m] from those of
+        ``others``. Compared are level cuts through the hulls."""
+        if not others:
+            return np.ones(len(tops), bool)
+        cut = tops + (self.length[one] * _LEVELS)[:, None, None] * self.axis[one]
+        own = self.radius[one] * np.sqrt(1.0 - (2.0 * _LEVELS - 1.0) ** 2)[:, None]
+        free = np.ones(len(tops), bool)
+        for k in others:
+            middle, axis, half, radius = self.at(k, self.top[k])
+            down = (cut[..., 2] - middle[2]) / axis[2]
+            centre = middle + down[..., None] * axis
+            between = np.linalg.norm((cut - centre)[..., :2], axis=-1)
+            there = radius * np.sqrt(np.maximum(1.0 - (down / half) ** 2, 0.0))
+            free &= ((between > own + there + gap) | (np.abs(down) > half + gap)).all(0)
+        return free
+
+
+def _outside(
+    hull: tuple[np.ndarray, np.ndarray, float, float],
+    wood: tuple[np.ndarray, np.ndarray],
+    gap: float,
+    hard: float = 1.0,
+) -> bool:
+    """Returns whether all balls of ``wood``, centres [n, 3] m and radii [n] m, keep the gap [m] from a hull. The hull
+    wider by ball and gap is taken as the spheroid whose half axes are longer by them. ``hard``: share of the hull's
+    half axes that counts."""
+    middle, axis, half, radius = hull
+    way = wood[0] - middle
+    along = way @ axis
+    across = way - along[:, None] * axis
+    wide = wood[1] + gap
+    nearness = (along / (hard * half + wide)) ** 2 + (across**2).sum(-1) / (hard * radius + wide) ** 2
+    return bool((nearness > 1.0).all())
 
 
 def _wood_of(
@@ -185,55 +236,6 @@ def _points_in(start: np.ndarray, end: np.ndarray, radius: np.ndarray) -> tuple[
     return points, radius[owner, 0] + share * (radius[:, 1] - radius[:, 0])[owner]
 
 
-def _along(line: np.ndarray) -> np.ndarray:
-    """Returns points [n, 3] m along a polyline [k, 3] m of short pieces."""
-    share = np.linspace(0.0, 1.0, 6)[:, None]
-    return np.concatenate([a + share * (b - a) for a, b in zip(line[:-1], line[1:], strict=True)])
-
-
-def _outside(
-    point: np.ndarray,
-    thick: np.ndarray | float,
-    top: np.ndarray,
-    axis: np.ndarray,
-    length: float,
-    radius: float,
-    gap: float,
-    hard: float = 1.0,
-) -> bool:
-    """Returns whether all balls about ``point`` [n, 3] m with radius ``thick`` [n] m keep the gap from the hull of a
-    bunch. The hull wider by ball and gap is taken as the spheroid whose two half axes are longer by them. ``hard``: share of the bunch's
-    half axes that counts."""
-    way = point - top
-    along = way @ axis
-    across = way - along[:, None] * axis
-    wide = thick + gap
-    half = 0.5 * length
-    long, broad = hard * half + wide, hard * radius + wide
-    return bool(((((along - half) / long) ** 2 + (across**2).sum(-1) / broad**2) > 1.0).all())
-
-
-def _clear_of_bunches(
-    top: np.ndarray,
-    axis: np.ndarray,
-    length: float,
-    radius: float,
-    gap: float,
-    kept: list[int],
-    tops: np.ndarray,
-    axes: np.ndarray,
-    lengths: np.ndarray,
-    radii: np.ndarray,
-) -> np.ndarray:
-    """Returns for each place ``top`` [place, 3] m of a bunch whether its hull keeps the gap from those of the bunches
-    ``kept``, whose properties are at these indices of the arrays. Compared are level cuts through the hulls."""
-    cut = top[:, None] + (length * _LEVELS)[:, None] * axis
-    own = radius * np.sqrt(1.0 - (2.0 * _LEVELS - 1.0) ** 2)
-    other = np.array(kept)
-    down = (tops[other][:, None, None, 2] - cut[..., 2]) / -axes[other, 2][:, None, None]
-    share = 2.0 * down / lengths[other][:, None, None] - 1.0
-    there = radii[other][:, None, None] * np.sqrt(np.maximum(1.0 - share**2, 0.0))
-    centre = tops[other][:, None, None] + down[..., None] * axes[other][:, None, None]
-    apart = np.linalg.norm((cut - centre)[..., :2], axis=-1)
-    margin = 1.0 + gap / (0.5 * lengths[other])[:, None, None]  # above and below a bunch its gap is kept, too
-    return ((apart > own + there + gap) | (np.abs(share) > margin)).all((0, 2))
+def _points_along(line: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns points [n, 3] m on a polyline [point, 3] m of wood and their radii [n] m."""
+    return _points_in(line[:-1], line[1:], np.full((len(line) - 1, 2), radius))
