@@ -16,6 +16,7 @@ from vinesim.scene.generation.vineyard import generate_uncached
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Clutter, Fruit, Scene, load_scene
+from vinesim.world import Physics
 
 VINES = 3
 
@@ -105,6 +106,16 @@ def test_shoots_wires_and_stalks_press_into_bunches_as_far_as_the_file_says(full
     wire = full.fixed_organ == int(Organ.WIRE)
     away, _share = _gap(core, full.fixed_start[wire].astype(float), full.fixed_end[wire].astype(float))
     assert (away - full.fixed_radius[wire].max() - (1.0 - press) * radius[:, None]).min() > 0.0
+
+
+def test_all_is_at_rest_as_generated(full) -> None:
+    """Nothing presses on anything, and no stalk or shoot turns, while all trees are awake."""
+    physics = Physics(full.copy())
+    physics.plants.wake(np.arange(len(full.tree_first)))
+    for _ in range(100):
+        physics.step()
+        assert not physics.contacts
+        assert physics.plants.tree_rate.max() < physics.parameters.sleep_rate
 
 
 def test_close_bunches_are_more_and_nearer_than_bunches_apart() -> None:

@@ -11,6 +11,7 @@ import dataclasses
 import numpy as np
 
 from vinesim.core import frames
+from vinesim.scene.builder import GRAVITY
 from vinesim.scene.generation.fixed_structure import FixedStructure
 from vinesim.scene.generation.fruit import MAX_BUCKLING_LOAD
 from vinesim.scene.generation.old_wood import with_old_wood
@@ -27,6 +28,9 @@ _STEP = 0.01
 """[m] Distance of the points at which wood is tested."""
 _LOWER_SLANT = 0.6
 """Slant of the lower half of a stalk, as a share of that of the upper half: GUESSED."""
+MAX_STALK_BEND = 0.7
+"""[rad] Largest angle by which its bunch may bend a stalk, sum over its two joints. Stalks that lead a heavy bunch far
+out have no stable shape."""
 _LEVELS = (np.arange(25) + 0.5) / 25.0
 """Places along a bunch's axis, as shares of its length, at which its hull is tested against those of other bunches."""
 
@@ -61,7 +65,8 @@ def hang_bunches(
     ``Scene.fruit.bunches``, in random order.
 
     A bunch is not kept if at no place the gap of its hull to wood, wires, stalks and kept bunches of its vine is at
-    least ``Bunch.gap``, if it would hang beyond its vine's plot, or if its upright shoot would buckle.
+    least ``Bunch.gap``, if it would hang beyond its vine's plot, if it would bend its stalk too far
+    (:data:`MAX_STALK_BEND`), or if its upright shoot would buckle.
 
     Args:
         scene: scene with the layout and the limits of the number of bunches.
@@ -89,7 +94,7 @@ def hang_bunches(
     chosen = np.zeros(burden.size, bool)
     line, out = peduncle.reshape(-1, PEDUNCLE_SEGMENTS + 1, 3).copy(), up.reshape(-1, 3).copy()
     load = burden.ravel()
-    length, radius, thick = (fruit[name].ravel() for name in ("length", "radius", "thick"))
+    mass, length, radius, thick = (fruit[name].ravel() for name in ("mass", "length", "radius", "thick"))
     hulls = _Hulls(line[:, -1], axis.reshape(-1, 3), length, radius)  # a view: hulls move with the ends of the stalks
     for vine, g in enumerate(structure.rngs):
         foot = structure.foot[vine, :2]
@@ -107,9 +112,11 @@ def hang_bunches(
             if carried[shoot] + load[one] >= MAX_BUCKLING_LOAD:
                 continue
             lines, levels = _places(line[one], out[one], slants)
-            inside = (np.abs(lines[:, -1, :2] - foot) + radius[one] + gap < half).all(-1)
-            for place in np.flatnonzero(inside & hulls.apart(one, lines[:, -1], kept, gap)):
-                stalk = _points_along(lines[place], thick[one])
+            stiff = parameters.peduncle.modulus.value * np.pi / 4.0 * float(thick[one]) ** 4
+            free = _stalk_bend(lines, float(mass[one]) / stiff) < MAX_STALK_BEND
+            free &= (np.abs(lines[:, -1, :2] - foot) + radius[one] + gap < half).all(-1)
+            for place in np.flatnonzero(free & hulls.apart(one, lines[:, -1], kept, gap)):
+                stalk = _points_along(lines[place], float(thick[one]))
                 hull = hulls.at(one, lines[place, -1])
                 if (
                     _outside(hull, old, gap)
@@ -138,6 +145,14 @@ def _places(line: np.ndarray, up: np.ndarray, slants: np.ndarray) -> tuple[np.nd
     middle = line[0] + upper * frames.normalize(tilt - [0.0, 0.0, 1.0])
     end = middle + lower * frames.normalize(_LOWER_SLANT * tilt - [0.0, 0.0, 1.0])
     return np.stack([np.broadcast_to(line[0], end.shape), middle, end], 1), level
+
+
+def _stalk_bend(lines: np.ndarray, load: float) -> np.ndarray:
+    """Returns the angles [place] rad by which a bunch bends its stalk, whose shapes are ``lines`` [place, 3, 3] m.
+    ``load``: mass over EI [kg/(N m^2)]."""
+    upper, lower = np.linalg.norm(lines[0, 1] - lines[0, 0]), np.linalg.norm(lines[0, 2] - lines[0, 1])
+    lever = np.linalg.norm((lines[:, 2:] - lines[:, :2])[..., :2], axis=-1)
+    return load * -GRAVITY[2] * (lever[:, 0] * 0.5 * upper + lever[:, 1] * 0.5 * (upper + lower))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
