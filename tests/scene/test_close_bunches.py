@@ -89,7 +89,9 @@ def test_no_bunch_is_inside_old_wood(full) -> None:
 
 def test_shoots_wires_and_stalks_press_into_bunches_as_far_as_the_file_says(full) -> None:
     """The core of a hull, the share that does not give way, keeps clear of all thin wood of its vine."""
-    press = plant_parameters.load_plant("wine_vine").bunch.press.value
+    bunch_parameters = plant_parameters.load_plant("wine_vine").bunch
+    assert bunch_parameters.press is not None
+    press = bunch_parameters.press.value
     q = full.forward_kinematics(full.joint_settled)
     centre, radius, bunch = _spheres(full)
     middle = q[full.bunch_body, :3] + 0.5 * full.bunch_length[:, None] * frames.rotate(

@@ -113,8 +113,9 @@ class Bunch(_Part, frozen=True, kw_only=True):
     gap: Annotated[Number | None, "m"] = None
     """Smallest level gap between the hulls of two bunches, and between a hull and wood or wires of its vine. Without it
     bunches keep 20 mm between their bounding cylinders, and arms and shoots are not taken into account."""
-    press: Annotated[Number, "1"] = Number(0.5, "1", "GUESSED", "bunches grow around shoots and wires")
-    """Share of a hull's half axes by which shoots, stalks and wires may press into a bunch, where ``gap`` is given."""
+    press: Annotated[Number | None, "1"] = None
+    """Share of a hull's half axes by which shoots, stalks and wires may press into a bunch, where ``gap`` is given;
+    0 by default."""
 
 
 class Rachis(_Part, frozen=True, kw_only=True):

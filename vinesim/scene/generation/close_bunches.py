@@ -85,7 +85,7 @@ def hang_bunches(
     """
     assert parameters.bunch.gap is not None
     gap = parameters.bunch.gap.value
-    hard = 1.0 - parameters.bunch.press.value
+    hard = 1.0 - (0.0 if parameters.bunch.press is None else parameters.bunch.press.value)
     low, high = scene.fruit.bunches
     per_vine = len(burden) * MAX_BUNCHES // len(structure.foot)
     fixed = with_old_wood(scene, structure, canes.points[:, 0]).fixed
