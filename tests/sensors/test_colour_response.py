@@ -254,7 +254,7 @@ def test_bad_values_are_one_clear_line(tmp_path) -> None:
             "value = [1.0, 2.0]",
             r"colour\.chroma is \[1\.0, 2\.0\] px; give \[1, 1\], \[2, 1\] or \[2, 2\]",
         ),
-        ("saturation = { value = 0.56", "saturation = { value = -1.0", r"colour\.saturation is -1 1; give 0 to 4 1"),
+        ("saturation = { value = 0.62", "saturation = { value = -1.0", r"colour\.saturation is -1 1; give 0 to 4 1"),
         (
             'full_well = { value = 26000.0, unit = "e"',
             'full_well = { value = 26000.0, unit = "ke"',
