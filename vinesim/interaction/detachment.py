@@ -17,7 +17,7 @@ from vinesim.contact.contact_solver import ContactSolver
 from vinesim.core import frames
 from vinesim.core.errors import checked_index
 from vinesim.core.warp_arrays import share
-from vinesim.interaction.stalk import cut_place, present_pieces, stalk_below, with_stalk
+from vinesim.interaction.stalk import cut_place, leave_stump, model_pieces, stalk_below, with_settled_stalk, with_stalk
 from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.plants.tree_checks import count_overloaded_steps
 from vinesim.plants.articulation_solver import ArticulationSolver, spans
@@ -29,8 +29,7 @@ from vinesim.scene.values import Contact, Detachment
 
 STUB_MASS = 1e-3
 """Mass of the stub that stays on the tree in place of a bunch [kg]."""
-GHOST_SHARE = 1e-3
-"""Share of its mass that a segment of stalk keeps on the tree after it has left with its bunch."""
+
 
 
 @dataclasses.dataclass(slots=True)
@@ -330,13 +329,11 @@ class DetachmentMonitor:
     ) -> tuple[FreeBunch, np.ndarray]:
         """Split a peduncle at ``at`` [m] along ``segment``. Returns the bunch with the stalk beyond the cut, and its
         velocity [6] in world axes. The stump stays on the vine, where it can be touched.
-
-        The segments that have left the vine keep a thousandth of their mass there, like the stub of the bunch.
         """
         plants = self.plants
         state = plants.state
         segments = stalk_below(plants.model, bunch, segment)
-        stump, pieces = present_pieces(plants, segments, at)
+        pieces = model_pieces(plants.model, segments, at)
         frame, *above = _unit_poses(state.body_q[[plants.model.bunch_body[bunch], *segments]])
         back = frames.conjugate(frame[3:])
         rates = np.concatenate([velocity[None], state.body_qd[segments].astype(float)])
@@ -344,10 +341,7 @@ class DetachmentMonitor:
         poses = frames.compose(frames.inverse(frame), np.array(above))
         radii = plants.model.body_radius[segments].mean(1).astype(float)
         whole, own = with_stalk(loose, rates[0], pieces, poses, rates[1:], radii)
-        plants.set_inertia(segment, stump.mass, stump.com, stump.inertia)
-        for body in segments[1:]:
-            plants.set_mass(body, GHOST_SHARE * float(plants.body_mass[body]))
-        self.contact_solver.leave_stump(segment, at)
+        leave_stump(plants, self.contact_solver, segments, at)
         state.cut_segment[bunch] = segment
         state.cut_at[bunch] = at
         velocity = frames.rotate(frame[3:], own.reshape(2, 3)).ravel()
@@ -380,11 +374,27 @@ class DetachmentMonitor:
     def apply_remote_pick(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
         """Detach a bunch that another client has detached, and set its ``pose`` [7] and ``velocity`` [6].
 
-        The bunch is not listed in this client's detachments.
+        The bunch is not listed in this client's detachments. It has the stalk that its record names, if that has
+        arrived (``State.cut_segment``).
         """
-        self._pick(bunch, "remote", "", np.zeros(6))
+        segment = int(self.plants.state.cut_segment[bunch])
+        place = None if segment < 0 else (segment, float(self.plants.state.cut_at[bunch]))
+        self._pick(bunch, "remote", "", np.zeros(6), place)
         self._detachments.pop()
         self.rigid.place_bunch(bunch, pose, velocity)
+
+    def restore_stalk(self, bunch: int) -> None:
+        """Give a free bunch the stalk that ``State.cut_segment`` names, if the bunch has a body. Its record has come
+        after its motion."""
+        if bunch in self.rigid.free_bunches:
+            state = self.plants.state
+            segment = int(state.cut_segment[bunch])
+            at = float(state.cut_at[bunch])
+            model = self.plants.model
+            leave_stump(self.plants, self.contact_solver, stalk_below(model, bunch, segment), at)
+            self.rigid.replace_bunch(
+                bunch, with_settled_stalk(model, bunch, self.rigid.free_bunch(bunch), segment, at)
+            )
 
     def apply_remote_cut(self, body: int) -> None:
         """Cut off a body that another client has cut off."""

@@ -11,6 +11,7 @@ import dataclasses
 
 import numpy as np
 
+from vinesim.contact.contact_solver import ContactSolver
 from vinesim.core import frames
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.rigid.free_bunch import FreeBunch
@@ -19,6 +20,8 @@ from vinesim.scene.model import Model
 
 PLACE_STEP = 1e-4
 """Unit in which the place of a cut along its segment is counted [m], so that all clients cut at the same place."""
+GHOST_SHARE = 1e-3
+"""Share of its mass that a segment of stalk keeps on the tree after it has left with its bunch."""
 SHORTEST = 5e-4
 """Shortest part that a cut leaves on either side [m]. A shorter part would be too light for its joint."""
 
@@ -86,17 +89,54 @@ def stalk_below(model: Model, bunch: int, segment: int) -> list[int]:
     raise ValueError(f"body {segment} is no segment of the peduncle of bunch {bunch}")
 
 
-def present_pieces(plants: ArticulationSolver, segments: list[int], at: float) -> tuple[Piece, list[Piece]]:
-    """Returns the stump of the first of ``segments``, cut at ``at`` [m], and the pieces of all segments beyond the
-    cut."""
-    columns = (plants.model.body_length, plants.body_mass, plants.body_com, plants.body_inertia)
+def is_on_stalk(model: Model, bunch: int, segment: int, at: float) -> bool:
+    """Returns whether a bunch can have been cut ``at`` [m] along ``segment``."""
+    try:
+        return segment in stalk_below(model, bunch, segment) and abs(cut_place(model, segment, at) - at) < PLACE_STEP
+    except ValueError:
+        return False
+
+
+def leave_stump(plants: ArticulationSolver, contact_solver: ContactSolver, segments: list[int], at: float) -> None:
+    """Leave on the vine what is before a cut ``at`` [m] along the first of ``segments``: the stump, which can be
+    touched. The other segments keep :data:`GHOST_SHARE` of their mass there, as the bunch leaves a stub."""
+    model = plants.model
+    columns = (model.body_length, model.body_mass, model.body_com, model.body_inertia)
+    length, mass, com, inertia = (column[segments[0]].astype(float) for column in columns)
+    stump, _ = split(float(length), float(mass), com, inertia, at)
+    plants.set_inertia(segments[0], stump.mass, stump.com, stump.inertia)
+    for body in segments[1:]:
+        plants.set_mass(body, GHOST_SHARE * float(model.body_mass[body]))
+    contact_solver.leave_stump(segments[0], at)
+
+
+def with_settled_stalk(model: Model, bunch: int, free: FreeBunch, segment: int, at: float) -> FreeBunch:
+    """Returns a free bunch with its stalk in the shape in which it hung at rest. A client that did not see the cut
+    knows no other."""
+    segments = stalk_below(model, bunch, segment)
+    chain = np.array([*segments[1:], int(model.bunch_body[bunch])])
+    joint = frames.pose(
+        model.body_offset[chain].astype(float),
+        frames.normalize(frames.multiply(model.body_rest[chain], model.joint_settled[chain]).astype(float)),
+    )
+    above = [frames.pose(np.zeros(3))]
+    for step in joint[::-1]:
+        above.append(frames.compose(above[-1], frames.inverse(step)))
+    poses = np.array(above[:0:-1])
+    pieces = model_pieces(model, segments, at)
+    radii = model.body_radius[segments].mean(1).astype(float)
+    whole, _ = with_stalk(free, np.zeros(6), pieces, poses, np.zeros((len(pieces), 6)), radii)
+    return dataclasses.replace(whole, cut=(segment, at))
+
+
+def model_pieces(model: Model, segments: list[int], at: float) -> list[Piece]:
+    """Returns the pieces of ``segments`` beyond a cut ``at`` [m] along the first of them."""
+    columns = (model.body_length, model.body_mass, model.body_com, model.body_inertia)
     pieces = []
     for number, body in enumerate(segments):
         length, mass, com, inertia = (column[body].astype(float) for column in columns)
-        near, far = split(float(length), float(mass), com, inertia, at if number == 0 else 0.0)
-        pieces.append(far)
-        stump = near if number == 0 else stump
-    return stump, pieces
+        pieces.append(split(float(length), float(mass), com, inertia, 0.0 if number else at)[1])
+    return pieces
 
 
 def with_stalk(
