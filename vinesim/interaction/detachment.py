@@ -31,7 +31,6 @@ STUB_MASS = 1e-3
 """Mass of the stub that stays on the tree in place of a bunch [kg]."""
 
 
-
 @dataclasses.dataclass(slots=True)
 class Blade:
     """The mouth of a cutter: a box fixed to a link. When the blade closes, it cuts the wood that passes through the
@@ -340,12 +339,12 @@ class DetachmentMonitor:
         rates = frames.rotate(back, rates.reshape(-1, 3)).reshape(-1, 6)
         poses = frames.compose(frames.inverse(frame), np.array(above))
         radii = plants.model.body_radius[segments].mean(1).astype(float)
-        whole, own = with_stalk(loose, rates[0], pieces, poses, rates[1:], radii)
+        whole, own = with_stalk(loose, rates[0], segment, pieces, poses, rates[1:], radii)
         leave_stump(plants, self.contact_solver, segments, at)
         state.cut_segment[bunch] = segment
         state.cut_at[bunch] = at
         velocity = frames.rotate(frame[3:], own.reshape(2, 3)).ravel()
-        return dataclasses.replace(whole, cut=(segment, at)), velocity
+        return whole, velocity
 
     def cut(self, body: int, cause: str = "command", actor: str = "", at: float | None = None) -> None:
         """Cut a piece of wood. What is beyond the cut falls. Call this between steps.
@@ -392,9 +391,7 @@ class DetachmentMonitor:
             at = float(state.cut_at[bunch])
             model = self.plants.model
             leave_stump(self.plants, self.contact_solver, stalk_below(model, bunch, segment), at)
-            self.rigid.replace_bunch(
-                bunch, with_settled_stalk(model, bunch, self.rigid.free_bunch(bunch), segment, at)
-            )
+            self.rigid.replace_bunch(bunch, with_settled_stalk(model, bunch, self.rigid.free_bunch(bunch), segment, at))
 
     def apply_remote_cut(self, body: int) -> None:
         """Cut off a body that another client has cut off."""

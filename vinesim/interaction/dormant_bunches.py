@@ -130,7 +130,10 @@ class DormantBunches:
         """Returns the visible shapes of all dormant bunches, as in :meth:`RigidWorld.visuals`."""
         if self._visuals is None:
             order = sorted(self._bunches)
-            self._visuals = tuple(RigidVisual(f"bunch/{i}", Organ.BUNCH, i, self._bunches[i].shapes) for i in order)
+            self._visuals = tuple(
+                RigidVisual(f"bunch/{i}", Organ.BUNCH, i, self._bunches[i].shapes, self._bunches[i].stalk)
+                for i in order
+            )
             supports = np.array([self._support[i] for i in order])
             poses = np.array([self._relative[i] for i in order]).reshape(-1, 7)
             rows_on = [(str(support), np.flatnonzero(supports == support)) for support in np.unique(supports)]

@@ -17,6 +17,7 @@ from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.rigid.free_bunch import FreeBunch
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
+from vinesim.scene.values import Stalk
 
 PLACE_STEP = 1e-4
 """Unit in which the place of a cut along its segment is counted [m], so that all clients cut at the same place."""
@@ -125,8 +126,8 @@ def with_settled_stalk(model: Model, bunch: int, free: FreeBunch, segment: int, 
     poses = np.array(above[:0:-1])
     pieces = model_pieces(model, segments, at)
     radii = model.body_radius[segments].mean(1).astype(float)
-    whole, _ = with_stalk(free, np.zeros(6), pieces, poses, np.zeros((len(pieces), 6)), radii)
-    return dataclasses.replace(whole, cut=(segment, at))
+    whole, _ = with_stalk(free, np.zeros(6), segment, pieces, poses, np.zeros((len(pieces), 6)), radii)
+    return whole
 
 
 def model_pieces(model: Model, segments: list[int], at: float) -> list[Piece]:
@@ -140,12 +141,18 @@ def model_pieces(model: Model, segments: list[int], at: float) -> list[Piece]:
 
 
 def with_stalk(
-    bunch: FreeBunch, velocity: np.ndarray, pieces: list[Piece], poses: np.ndarray, rates: np.ndarray, radii: np.ndarray
+    bunch: FreeBunch,
+    velocity: np.ndarray,
+    segment: int,
+    pieces: list[Piece],
+    poses: np.ndarray,
+    rates: np.ndarray,
+    radii: np.ndarray,
 ) -> tuple[FreeBunch, np.ndarray]:
     """Returns a free bunch with the pieces of its stalk fixed to it, and the velocity [6] of its frame with which it
     has the linear and angular momentum of its parts.
 
-    ``velocity`` [6] m/s, rad/s: velocity of the bunch alone, in its own axes. ``poses`` [piece, 7] of the segments'
+    ``velocity`` [6] m/s, rad/s: velocity of the bunch alone, in its own axes. ``segment``: the first piece's. ``poses`` [piece, 7] of the segments'
     frames and ``rates`` [piece, 6] of their origins, both in the bunch's frame. ``radii`` [piece] m.
     """
     yz, zx, xy = bunch.product
@@ -167,9 +174,7 @@ def with_stalk(
     whole = float(mass.sum())
     com = mass @ center / whole
     arm = center - com
-    tensor = sum(
-        own + m * ((r @ r) * np.eye(3) - np.outer(r, r)) for own, m, r in zip(tensors, mass, arm, strict=True)
-    )
+    tensor = sum(own + m * ((r @ r) * np.eye(3) - np.outer(r, r)) for own, m, r in zip(tensors, mass, arm, strict=True))
     linear = mass @ np.array(speeds)
     angular = sum(
         own @ spin + m * np.cross(r, speed)
@@ -189,6 +194,6 @@ def with_stalk(
         start=np.concatenate([bunch.start, stalk[:, 0]]),
         end=np.concatenate([bunch.end, stalk[:, 1]]),
         radius=np.concatenate([bunch.radius, radii]),
-        stalk=len(pieces),
+        stalk=Stalk(segment, pieces[0].start, len(pieces)),
     )
     return fixed, np.concatenate([linear / whole - np.cross(spin, com), spin])

@@ -17,7 +17,7 @@ from vinesim.core import frames
 from vinesim.rigid.static_world import ALL_BITS, CRATE_FLOOR, FREE_BUNCH, contact_friction, geom_user
 from vinesim.scene.materials import Material
 from vinesim.scene.physics_parameters import PhysicsParameters
-from vinesim.scene.values import Shape
+from vinesim.scene.values import Shape, Stalk
 
 MAX_GEOMS = 12
 """Largest number of collision shapes of a free bunch, and number of geoms of each body in the pool."""
@@ -83,10 +83,8 @@ class FreeBunch:
     """[shape, 3] m, end of a capsule's axis."""
     radius: np.ndarray
     """[shape] m, radius of each sphere or capsule."""
-    stalk: int = 0
-    """Number of shapes, the last ones, that are pieces of the stalk above the bunch."""
-    cut: tuple[int, float] | None = None
-    """Segment of the peduncle in which the bunch was cut off, and the place [m] along it; None: no stalk."""
+    stalk: Stalk | None = None
+    """Stalk above the bunch, whose pieces are the last shapes; None: it parted at its joint."""
 
     @functools.cached_property
     def shapes(self) -> tuple[Shape, ...]:
@@ -94,7 +92,8 @@ class FreeBunch:
         axis = self.end - self.start
         middle = 0.5 * (self.start + self.end)
         half = 0.5 * np.linalg.norm(axis, axis=-1)
-        colours = [_FRUIT] * (len(self.radius) - self.stalk) + [_STALK] * self.stalk
+        pieces = 0 if self.stalk is None else self.stalk.pieces
+        colours = [_FRUIT] * (len(self.radius) - pieces) + [_STALK] * pieces
         turn = frames.multiply(frames.from_x_axis(axis), _Z_TO_X)
         return tuple(
             Shape("capsule", (float(r), float(h)), frames.pose(p, q), rgba)
