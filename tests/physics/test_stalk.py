@@ -170,7 +170,7 @@ def test_a_bunch_is_cut_where_the_blade_is(height):
 
 
 def test_the_stump_can_be_touched_and_ends_at_the_cut():
-    physics, at = cut_by_blade(0.01)
+    physics, _ = cut_by_blade(0.01)
     model = physics.model
     body = int(model.bunch_body[0]) - 1
     physics.remove_robot("bar")

@@ -152,8 +152,9 @@ def with_stalk(
     """Returns a free bunch with the pieces of its stalk fixed to it, and the velocity [6] of its frame with which it
     has the linear and angular momentum of its parts.
 
-    ``velocity`` [6] m/s, rad/s: velocity of the bunch alone, in its own axes. ``segment``: the first piece's. ``poses`` [piece, 7] of the segments'
-    frames and ``rates`` [piece, 6] of their origins, both in the bunch's frame. ``radii`` [piece] m.
+    ``velocity`` [6] m/s, rad/s: velocity of the bunch alone, in its own axes. ``segment``: body of the first piece.
+    ``poses`` [piece, 7] of the segments' frames and ``rates`` [piece, 6] of their origins, both in the bunch's frame.
+    ``radii`` [piece] m.
     """
     yz, zx, xy = bunch.product
     tensors = [np.diag(bunch.inertia) + np.array([[0.0, xy, zx], [xy, 0.0, yz], [zx, yz, 0.0]])]
