@@ -206,3 +206,42 @@ def test_two_runs_with_cuts_are_bitwise_equal():
         return physics.snapshot().body_q.tobytes() + physics.rigid.mj_data.qpos.tobytes()
 
     assert run() == run()
+
+
+def test_a_stalk_that_is_known_late_weighs_the_same():
+    """As when the motion of a bunch reaches a client before the record that names the cut: before the bunch leaves,
+    while it is free, and while it is dormant."""
+    masses = []
+    for when in ("own", "before", "after", "dormant"):
+        model, body, _ = bunch_scene()
+        physics = Physics(model)
+        segment = body - 2
+        pose = physics.snapshot().body_q[body].astype(float)
+        if when == "own":
+            physics.cut(segment, 0.013)
+        if when == "before":
+            physics.apply_remote_stalk(0, segment, 0.013)
+        if when in ("before", "after"):
+            physics.apply_remote_pick(0, pose, np.zeros(6))
+        if when == "dormant":
+            physics.dormant_bunches.add([0], [""], pose[None])
+        if when in ("after", "dormant"):
+            physics.apply_remote_stalk(0, segment, 0.013)
+        if when == "dormant":
+            physics.dormant_bunches.activate([0])
+        free = physics.rigid.free_bunch(0)
+        masses.append([free.mass, *free.com, *free.inertia, float(physics.plants.body_mass[segment])])
+        assert free.stalk is not None
+        assert (free.stalk.segment, free.stalk.pieces) == (segment, 2)
+        for _ in range(5):
+            physics.step()
+        assert physics.snapshot().visuals[0].stalk is free.stalk
+    np.testing.assert_allclose(masses, np.broadcast_to(masses[0], (4, 8)), rtol=1e-5, atol=1e-7)
+
+
+def test_a_stalk_that_cannot_be_is_ignored():
+    model, body, _ = bunch_scene()
+    physics = Physics(model)
+    for segment, at in ((0, 0.01), (body, 0.01), (10**6, 0.01), (body - 1, 0.5), (body - 1, 0.0)):
+        physics.apply_remote_stalk(0, segment, at)
+        assert physics.state.cut_segment[0] == -1
