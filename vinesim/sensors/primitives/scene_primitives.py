@@ -118,6 +118,8 @@ class Primitives:
         self._picked_shapes: dict[int, np.ndarray] = {}
         self._stumps: dict[Stalk, dict[int, np.ndarray]] = {}
         """For each cut stalk, the drawn ends [2, 4] of its peduncle's segments before the cut, by primitive."""
+        self.stump_rows = np.zeros(0, np.int64)
+        """Primitives [k] of plants that a cut has ever shortened, ascending."""
         self._stump_trees = np.zeros(0, np.int64)
         """Trees [k] whose stumps the last change of rigid bodies has changed."""
         self._rigid: dict[tuple[Organ, int, int], tuple[tuple[Shape, ...], ClusterLayout | None]] = {}
@@ -349,6 +351,7 @@ class Primitives:
                         start[3] = shown[3] = _NOTHING
                     for column, value in zip(ends, (start, shown), strict=True):
                         column[row : row + 1].assign(value[None])
+            self.stump_rows = np.union1d(self.stump_rows, list(kept))
 
     def _segments_below(self, stalk: Stalk) -> list[int]:
         """Returns the segments of a peduncle from the one that was cut to the bunch."""
