@@ -455,7 +455,11 @@ def record(**change) -> RetainedRecord:
 
 
 def test_records_are_decoded_as_encoded():
-    sent = [record(), record(stalk=(12, 345)), record(object=ids.object_id(ids.ObjectKind.TREE, 5), parent="", cut=(7, 9), trees=b"abc")]
+    sent = [
+        record(),
+        record(stalk=(12, 345)),
+        record(object=ids.object_id(ids.ObjectKind.TREE, 5), parent="", cut=(7, 9), trees=b"abc"),
+    ]
     received = decode_records(encode_records(sent))
     assert received == sent
     assert received[0].claim == Claim(3, 65535, "picker")

@@ -131,7 +131,7 @@ def test_random_cuts_keep_mass_centre_inertia_and_momentum(scene):
         parts = of_plants(physics, [segment], origin), of_free_bunch(physics, bunch, origin)
         for name, was, *now in zip(("mass", "centre", "inertia", "momentum", "spin"), before, *parts, strict=True):
             error = np.abs(sum(now) - was).max() / np.abs(was).max()
-            assert error < (1e-6 if name in ("mass", "centre", "inertia") else 1e-5), (bunch, name, error)
+            assert error < 1e-6, (bunch, name, error)
     for _ in range(20):
         physics.step()
     assert physics.faults == faults

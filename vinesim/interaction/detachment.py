@@ -412,8 +412,9 @@ class DetachmentMonitor:
         tree = int(self.plants.model.body_tree[body])
         force = carried[:3].astype(float)
         moment = carried[3:].astype(float)
+        segment, at = (-1, 0.0) if place is None else place
         self._detachments.append(
-            Detachment(self.plants.tick, tree, body, bunch, cause, actor, force, moment, *(place or ()))
+            Detachment(self.plants.tick, tree, body, bunch, cause, actor, force, moment, segment, at)
         )
 
     def _hardest_pressing_actor(self, bunch: int) -> str:

@@ -175,12 +175,11 @@ def with_stalk(
     whole = float(mass.sum())
     com = mass @ center / whole
     arm = center - com
-    tensor = sum(own + m * ((r @ r) * np.eye(3) - np.outer(r, r)) for own, m, r in zip(tensors, mass, arm, strict=True))
     linear = mass @ np.array(speeds)
-    angular = sum(
-        own @ spin + m * np.cross(r, speed)
-        for own, spin, m, r, speed in zip(tensors, spins, mass, arm, speeds, strict=True)
-    )
+    own = np.einsum("kij,kj->i", np.array(tensors), np.array(spins))
+    angular = own + (mass[:, None] * np.cross(arm, np.array(speeds))).sum(0)
+    tensors += [m * ((r @ r) * np.eye(3) - np.outer(r, r)) for m, r in zip(mass, arm, strict=True)]
+    tensor = np.array(tensors).sum(0)
     spin = np.linalg.solve(tensor, angular)
     ends = [
         pose[:3] + frames.rotate(pose[3:], np.array([[piece.start, 0.0, 0.0], [piece.end, 0.0, 0.0]]))
