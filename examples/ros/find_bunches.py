@@ -18,7 +18,6 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CameraInfo, Image
 
-
 VIVIDNESS = 2.5
 """Factor on the distance of a colour from grey: a D435 has pale colours."""
 
