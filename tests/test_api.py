@@ -9,6 +9,7 @@ import subprocess
 import sys
 import urllib.error
 import urllib.request
+import warnings
 
 import numpy as np
 import pytest
@@ -470,3 +471,32 @@ def test_a_push_on_what_is_not_there_is_refused():
         simulation.push_robot("bob", "arm_left_7_link", (0.0, 1.0))
     with pytest.raises(Exception, match="no_such_link"):
         simulation.push_robot("bob", "no_such_link", (0.0, 0.0, 1.0))
+
+
+# ---------------------------------------------------------------- faults
+
+
+def test_a_tree_that_is_stopped_is_counted_and_warned_of_once():
+    simulation = vinesim.Simulation(vinesim.CaneBuilder())
+    simulation.step()
+    assert simulation.faults == {}
+    body = simulation.tip_body()
+    simulation.apply_wrench(body, (1e30, 0.0, 0.0))
+    with pytest.warns(RuntimeWarning, match="1 trees moved too fast, .* reset to rest .*trees_stopped") as told:
+        simulation.step(2)
+    assert [one.filename for one in told] == [__file__]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        simulation.apply_wrench(body, (1e30, 0.0, 0.0))
+        simulation.step(2)
+    assert simulation.faults == {"trees_stopped": 2}
+
+
+def test_a_tree_that_turns_too_fast_is_counted_and_warned_of():
+    """A base joint without a spring is let go at 100 rad/s, twice the limit."""
+    spinning = vinesim.Simulation(vinesim.CaneBuilder(base="pinned", segments=1), sleep=False)
+    spinning.state.joint_qd[0, 1] = 100.0
+    with pytest.warns(RuntimeWarning, match="turned faster than max_joint_rate") as told:
+        spinning.step()
+    assert set(spinning.faults) == {"trees_slowed"}
+    assert len(told) == 1

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import pathlib
+import warnings
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,7 @@ import msgspec
 import numpy as np
 
 from vinesim.api.energy import Energy, Momentum, energy, momentum
+from vinesim.client.faults import FaultLog, occurred
 from vinesim.core import frames, progress
 from vinesim.core.errors import UsageError, checked_index
 from vinesim.kernels.compilation import PHYSICS_PACKAGES, compile_kernels
@@ -111,13 +113,17 @@ class Simulation:
         self._detachments: list[Detachment] = []
         self._primitives: Primitives | None = None
         self._sway = Sway(model)
+        self._fault_log = FaultLog(_warn_caller_of_step)
         self.physics.sleep_monitor.wake_unbalanced()
 
     # ------------------------------------------------------------------ time
 
     def step(self, count: int = 1) -> None:
         """Advance by ``count`` steps of :attr:`dt`. Wrenches of :meth:`apply_wrench` and :meth:`push_robot` act in all
-        these steps and then end."""
+        these steps and then end.
+
+        At the first fault of each kind (see :attr:`faults`), a ``RuntimeWarning`` says what happened.
+        """
         if not isinstance(count, int | np.integer) or count < 0:
             raise UsageError(f"count is {count}; give a whole number of steps, 0 or more")
         self._detachments = []
@@ -136,6 +142,7 @@ class Simulation:
         for robot, link in self._pushed:
             self.physics.rigid.apply_wrench(robot, link, np.zeros(3))
         self._pushed.clear()
+        self._fault_log.update(self.faults, self.time)
 
     @property
     def time(self) -> float:
@@ -178,6 +185,17 @@ class Simulation:
     def detachments(self) -> tuple[Detachment, ...]:
         """Bunches and canes that left their plant in the last call of :meth:`step`."""
         return tuple(self._detachments)
+
+    @property
+    def faults(self) -> dict[str, int]:
+        """Number of faults since the start, by kind; empty if none occurred. After a fault the motion is not that of
+        the model: results may be wrong.
+
+        Kinds: ``trees_stopped`` and ``robots_stopped`` (too fast or not finite, so put at rest), ``trees_slowed`` (in
+        how many steps a joint of a tree exceeded ``max_joint_rate``), ``contacts_dropped`` (more than the capacity),
+        ``geoms_skipped`` (static objects near a tree, more than ``max_static_geoms_per_tree``), ``grasps_refused``.
+        """
+        return occurred(self.physics.faults)
 
     def energy(self, tree: int | None = None) -> Energy:
         """Returns the kinetic, elastic and gravitational energy [J] of the plants, or of one tree."""
@@ -377,6 +395,11 @@ def model_of(source: Model | Scene | CaneBuilder | TreeBuilder | Iterable[CaneBu
     if not all(isinstance(one, (CaneBuilder, TreeBuilder)) for one in canes):
         raise UsageError(f"cannot simulate a {type(source).__name__}; give a scene, a model or cane builders")
     return assemble(canes)
+
+
+def _warn_caller_of_step(text: str) -> None:
+    """Warn at the line that called :meth:`Simulation.step`."""
+    warnings.warn(text, RuntimeWarning, stacklevel=4)  # above: FaultLog.update, Simulation.step, the caller
 
 
 def _vector(name: str, value: Sequence[float] | np.ndarray, unit: str) -> np.ndarray:
