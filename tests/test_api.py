@@ -20,6 +20,7 @@ from vinesim.core import frames
 from vinesim.core.errors import UsageError
 from vinesim.net.codec.control import Hello, encode_hello
 from vinesim.net.recording.mcap_writer import RecordingWriter
+from vinesim.scene.builder import RodMaterial, TreeBuilder
 
 G = 9.81
 EI = 5e9 * np.pi / 4.0 * 0.004**4
@@ -500,3 +501,120 @@ def test_a_tree_that_turns_too_fast_is_counted_and_warned_of():
         spinning.step()
     assert set(spinning.faults) == {"trees_slowed"}
     assert len(told) == 1
+
+
+# ---------------------------------------------------------------- impossible values
+
+
+def bunch_on_cane(mass=0.3, **fields):
+    tree = vinesim.CaneBuilder(length=0.5, damping_ratio=0.1).tree()
+    tree.add_bunch(len(tree.bodies) - 1, mass, **fields)
+    return vinesim.assemble([tree])
+
+
+def with_model_value(name, value):
+    model = bunch_on_cane()
+    getattr(model, name)[0] = value
+    return vinesim.Simulation(model)
+
+
+def with_state_value(simulation, name, value, call):
+    getattr(simulation.state, name)[3] = value
+    call(simulation)
+
+
+def rod(length=0.5, segments=4, bends=None, rest=frames.IDENTITY, **material):
+    tree = TreeBuilder(frames.pose(np.array([0.0, 0.0, 1.0])))
+    wood = RodMaterial(**{"modulus": 5e9, "density": 800.0, "damping": 0.01} | material)
+    tree.add_rod(-1, length, (0.004, 0.003), wood, segments, bends=bends, rest=rest)
+    return vinesim.Simulation(tree)
+
+
+NAN = float("nan")
+ON_A_CANE = [
+    (lambda s: s.cut(True), "body True does not exist; give 0 to 15, a whole number"),
+    (lambda s: s.cut(np.True_), "body True does not exist; give 0 to 15, a whole number"),
+    (lambda s: s.tip(False), "tree False does not exist; give 0 to 0, a whole number"),
+    (lambda s: s.step(True), "count is True; give a whole number of steps, 0 or more"),
+    (lambda s: s.apply_wrench(0, (True, False, True)), r"force is .*; give three finite numbers \[N\]"),
+    (lambda s: s.apply_wrench(0, (True, 0.0, 1.0)), r"force is .*; give three finite numbers \[N\]"),
+    (lambda s: s.apply_wrench(0, ("1", "2", "3")), r"force is .*; give three finite numbers \[N\]"),
+    (lambda s: s.apply_wrench(0, (1e39, 0.0, 0.0)), r"force is .*; give three finite numbers \[N\]"),
+    (lambda s: s.apply_wrench(0, (0, 0, 1), at=(NAN, 0, 0)), r"at is .*; give three finite numbers \[m\]"),
+    (
+        lambda s: with_state_value(s, "joint_q", 0.0, lambda s: s.wake()),
+        r"state.joint_q\[3\] is \[0.0, .*; give a unit q",
+    ),
+    (
+        lambda s: with_state_value(s, "joint_q", 0.0, lambda s: s.step()),
+        r"state.joint_q\[3\] is \[0.0, .*; give a unit q",
+    ),
+    (lambda s: with_state_value(s, "joint_q", (0, 0, 0, 2), lambda s: s.step()), "give a unit quaternion"),
+    (
+        lambda s: with_state_value(s, "joint_q", NAN, lambda s: s.step()),
+        r"state.joint_q\[3\] is \[nan, .*; give a unit",
+    ),
+    (
+        lambda s: with_state_value(s, "joint_qd", NAN, lambda s: s.step()),
+        r"state.joint_qd\[3\] is \[nan, .*finite rates",
+    ),
+    (lambda s: s.add_robot("vinebot", (True, 0, 0)), r"pose is \(True, 0, 0\); give \(x, y, yaw\)"),
+    (lambda s: s.add_robot("vinebot", name=3), "name is 3; give a text, or none"),
+    (lambda s: s.add_robot("vinebot").command_base(True, 0.0, 0.0), r"base velocity is \(True, 0.0\); give finite"),
+    (lambda s: s.add_robot("vinebot").command_position([True], ["head_1_joint"]), "'head_1_joint' is not finite; give"),
+]
+ALONE = [
+    (lambda: vinesim.Simulation(vinesim.CaneBuilder(), dt=True), "physics.dt is True; give a finite number"),
+    (lambda: vinesim.Simulation(vinesim.CaneBuilder(), detach="no"), "detach is 'no'; give True or False"),
+    (lambda: vinesim.Simulation(vinesim.CaneBuilder(), device=3), "device 3: give cpu, cuda or cuda:N"),
+    (lambda: vinesim.cane(length=True), "cane: length is True; give a finite number above 0"),
+    (lambda: vinesim.cane(segments=True), "cane: segments is True; give a whole number, 1 or more"),
+    (lambda: vinesim.cane(radius=(True, 0.004)), r"cane: radius\[0\] is True; give a finite number above 0"),
+    (lambda: vinesim.cane(tip_mass=True), "cane: tip_mass is True; give a finite number of 0 or more"),
+    (lambda: vinesim.cane(pose="here"), "cane: pose is here; give position .* and unit quaternion"),
+    (lambda: vinesim.cane(pose=(0, 0, 1, 0, 0, 0, 0)), "cane: pose is .*; give position .* and unit quaternion"),
+    (lambda: with_model_value("bunch_pull", -1.0), "bunch 0: bunch_pull is -1.0; give a number above 0"),
+    (lambda: with_model_value("bunch_bend", 0.0), "bunch 0: bunch_bend is 0.0; give a number above 0"),
+    (lambda: with_model_value("bunch_variety", 99), "bunch 0: bunch_variety is 99; give 0 to"),
+    (lambda: with_model_value("bunch_body", 99), "bunch 0: bunch_body is 99; give 0 to"),
+    (lambda: with_model_value("tree_pose", 0.0), "root frame's rotation .*; give a unit quaternion xyzw"),
+    (lambda: with_model_value("body_organ", 99), "body 0 of tree 0: organ 99; give a member of vinesim.Organ"),
+    (lambda: bunch_on_cane(pull=-1.0), "bunch on body 15: pull is -1.0; give a finite number above 0"),
+    (lambda: bunch_on_cane(bend=True), "bunch on body 15: bend is True; give a finite number above 0"),
+    (lambda: bunch_on_cane(pul=3.0), "bunch on body 15 has no field 'pul'; it has: pull, bend"),
+    (lambda: bunch_on_cane(mass=True), "bunch of True kg, .* give a finite mass above 0"),
+    (lambda: bunch_on_cane(count=2.5), "bunch of 0.3 kg, 2.5 berries; give a finite mass above 0"),
+    (lambda: bunch_on_cane(seed=-1), "bunch on body 15: seed is -1; give a whole number from 0"),
+    (lambda: rod(length=NAN), "rod of length nan m, .*: all must be positive and finite"),
+    (lambda: rod(segments=2.5), "rod of .* 2.5 segments, .* segments a whole number"),
+    (lambda: rod(damping=-1.0), "rod of .*damping=-1.0.*: all must be positive and finite"),
+    (lambda: rod(shear_modulus=NAN), "rod of .*shear_modulus=nan.*: all must be positive and finite"),
+    (lambda: rod(bends=np.zeros((2, 4))), r"rod: bends has the shape \(2, 4\); give \[4, 4\]"),
+    (lambda: rod(rest=np.zeros(4)), "rest rotation .*; give a unit quaternion xyzw"),
+    (lambda: vinesim.load_scene("demo", seed=True), "seed is True: give a whole number of 0 or more"),
+    (lambda: vinesim.load_scene("demo", seed=1.5), "seed is 1.5: give a whole number of 0 or more"),
+    (lambda: vinesim.look_at((NAN, 0, 0), (1, 0, 0)), "cannot look from .*; give two points"),
+    (lambda: next(iter(vinesim.sweep(abs, [1], workers=True))), "workers is True; give a whole number of 1 or more"),
+    (lambda: vinesim.reachable_grasps("demo", reach=NAN), r"reach is nan; give a finite number above 0 \[m\]"),
+    (lambda: vinesim.reachable_grasps("demo", spawn=True), "spawn is True; give a whole number"),
+]
+
+
+@pytest.mark.parametrize(("call", "message"), [pytest.param(*row, id=row[1][:40]) for row in ON_A_CANE])
+def test_calls_with_impossible_values_are_refused_and_the_world_goes_on(call, message):
+    simulation = vinesim.Simulation(vinesim.CaneBuilder(), sleep=False)
+    before = simulation.state.joint_q[3].copy()
+    with pytest.raises(ValueError, match=message) as error:
+        call(simulation)
+    assert "\n" not in str(error.value)
+    simulation.state.joint_q[3] = before
+    simulation.state.joint_qd[3] = 0.0
+    simulation.step()
+    assert simulation.faults == {}
+
+
+@pytest.mark.parametrize(("call", "message"), [pytest.param(*row, id=row[1][:40]) for row in ALONE])
+def test_impossible_values_are_refused_in_one_line(call, message):
+    with pytest.raises(ValueError, match=message) as error:
+        call()
+    assert "\n" not in str(error.value)

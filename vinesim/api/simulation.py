@@ -22,6 +22,7 @@ from vinesim.api.energy import Energy, Momentum, energy, momentum
 from vinesim.client.faults import FaultLog, occurred
 from vinesim.core import frames, progress
 from vinesim.core.errors import UsageError, checked_index
+from vinesim.core.numbers import as_numbers, checked_vector, is_whole
 from vinesim.kernels.compilation import PHYSICS_PACKAGES, compile_kernels
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot
@@ -85,6 +86,8 @@ class Simulation:
             detach: whether bunches detach when they are pulled too hard.
             device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``, for stepping plants and for cameras and lidars.
         """
+        if not isinstance(detach, bool):
+            raise UsageError(f"detach is {detach!r}; give True or False")
         _compile_kernels()
         self.scene: Scene | None = None
         """The simulated scene; None for a model or canes."""
@@ -124,8 +127,9 @@ class Simulation:
 
         At the first fault of each kind (see :attr:`faults`), a ``RuntimeWarning`` says what happened.
         """
-        if not isinstance(count, int | np.integer) or count < 0:
+        if not is_whole(count) or count < 0:
             raise UsageError(f"count is {count}; give a whole number of steps, 0 or more")
+        self._check_joints(self.physics.plants.awake)
         self._detachments = []
         for name in self.robots.keys() - set(self.physics.rigid.robots):  # robots that are no longer in the physics
             self._forget_robot(name)
@@ -240,8 +244,12 @@ class Simulation:
     # ------------------------------------------------------------------ actions
 
     def wake(self, tree: int | None = None) -> None:
-        """Wake a tree, or all trees, for the next step. Call it after joint rotations were written."""
+        """Wake a tree, or all trees, for the next step. Call it after joint rotations were written.
+
+        Raises :class:`UsageError` if a joint rotation is not a unit quaternion, or a joint rate is not finite.
+        """
         trees = np.arange(len(self.model.tree_first)) if tree is None else np.array([self._tree(tree)])
+        self._check_joints(trees)
         self.physics.wake(trees)
 
     def apply_wrench(
@@ -260,12 +268,12 @@ class Simulation:
             at: [3] m in the world, the point where the force acts; the body's centre of mass unless given.
         """
         body = self._body(body)
-        force = _vector("force", force, "N")
-        torque = _vector("torque", torque, "N m")
+        force = checked_vector("force", force, "N", UsageError)
+        torque = checked_vector("torque", torque, "N m", UsageError)
         pose = self.body_pose(body)
         point = pose[:3] + frames.rotate(pose[3:], self.physics.plants.body_com[body].astype(float))
         if at is not None:
-            point = _vector("at", at, "m")
+            point = checked_vector("at", at, "m", UsageError)
         load = self.physics.plants.body_load
         self._loads.setdefault(body, load[body].copy())
         load[body] += np.concatenate([force, torque + np.cross(point - pose[:3], force)]).astype(load.dtype)
@@ -290,10 +298,12 @@ class Simulation:
         """
         if robot not in self.robots:
             raise UsageError(f"no robot {robot!r}; there are: {', '.join(self.robots) or 'none'}")
-        force = _vector("force", force, "N")
-        torque = _vector("torque", torque, "N m")
+        force = checked_vector("force", force, "N", UsageError)
+        torque = checked_vector("torque", torque, "N m", UsageError)
         if at is not None:
-            torque = torque + np.cross(_vector("at", at, "m") - self.physics.rigid.link_centre(robot, link), force)
+            torque = torque + np.cross(
+                checked_vector("at", at, "m", UsageError) - self.physics.rigid.link_centre(robot, link), force
+            )
         self.physics.rigid.apply_wrench(robot, link, force, torque)
         self._pushed.add((robot, link))
 
@@ -324,6 +334,8 @@ class Simulation:
             base: how the base moves: ``planar`` (driven), ``free`` (the robot stands on its legs), ``fixed``, or
                 ``auto``: as the robot's files say.
         """
+        if not isinstance(name, str):
+            raise UsageError(f"name is {name!r}; give a text, or none")
         described = load_description(robot, base=base)
         index = self._robots_added
         name = name or f"robot_{index}"
@@ -367,6 +379,26 @@ class Simulation:
     def _one(self, tree: int | None) -> np.ndarray | None:
         return None if tree is None else np.array([self._tree(tree)])
 
+    def _check_joints(self, trees: np.ndarray) -> None:
+        """Raise :class:`UsageError` for the first body of ``trees`` [k] with an impossible joint rotation or rate: a
+        user may have written it."""
+        if len(trees) == 0:
+            return
+        model = self.model
+        state = self.physics.state
+        here = np.zeros(len(model.tree_first), bool)
+        here[trees] = True
+        bodies = np.flatnonzero(here[model.body_tree])
+        rotation = state.joint_q[bodies]
+        for name, bad, remedy in (
+            ("joint_q", ~(abs(np.einsum("bi,bi->b", rotation, rotation) - 1.0) < 2e-3), "a unit quaternion xyzw"),
+            ("joint_qd", ~np.isfinite(state.joint_qd[bodies]).all(1), "three finite rates [rad/s]"),
+        ):
+            if bad.any():
+                body = int(bodies[np.argmax(bad)])
+                value = getattr(state, name)[body].tolist()
+                raise UsageError(f"state.{name}[{body}] is {value}; give {remedy}")
+
     def _body(self, body: int) -> int:
         return checked_index("body", body, len(self.model.body_mass), UsageError)
 
@@ -374,7 +406,7 @@ class Simulation:
 def base_pose(pose: Sequence[float] | np.ndarray, terrain: Terrain | None = None) -> np.ndarray:
     """Returns the pose [7] of a robot's base from (x, y, yaw) in m and rad, on the ground, or from a pose [7]. Raises
     :class:`UsageError` for other values."""
-    given = _numbers(pose)
+    given = as_numbers(pose)
     if given.shape not in ((3,), (7,)) or not np.isfinite(given).all():
         shown = given.tolist() if given.ndim else pose
         raise UsageError(f"pose is {shown}; give (x, y, yaw) in m and rad, or position and quaternion [7]")
@@ -400,19 +432,3 @@ def model_of(source: Model | Scene | CaneBuilder | TreeBuilder | Iterable[CaneBu
 def _warn_caller_of_step(text: str) -> None:
     """Warn at the line that called :meth:`Simulation.step`."""
     warnings.warn(text, RuntimeWarning, stacklevel=4)  # above: FaultLog.update, Simulation.step, the caller
-
-
-def _vector(name: str, value: Sequence[float] | np.ndarray, unit: str) -> np.ndarray:
-    """Returns three finite numbers as an array. Raises :class:`UsageError` for other values."""
-    vector = _numbers(value)
-    if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise UsageError(f"{name} is {value}; give three finite numbers [{unit}]")
-    return vector
-
-
-def _numbers(value: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Returns ``value`` as an array of numbers; an array of one NaN if it is not numeric."""
-    try:
-        return np.asarray(value, float)
-    except (TypeError, ValueError):
-        return np.array(np.nan)

@@ -17,6 +17,7 @@ from typing import Literal
 import numpy as np
 
 from vinesim.core import frames
+from vinesim.core.numbers import is_number, is_whole
 from vinesim.scene import builder, plausibility
 from vinesim.scene.builder import RodMaterial, TreeBuilder
 from vinesim.scene.model import Model
@@ -138,12 +139,12 @@ class CaneBuilder:
         radii = np.broadcast_to(np.asarray(self.radius, object), 2)
         numbers |= {f"radius[{i}]": value for i, value in enumerate(radii.tolist())}
         for name, value in numbers.items():
-            if not (_is_finite(value) and value > 0.0):
+            if not (is_number(value) and value > 0.0):
                 raise ValueError(f"cane: {name} is {value}; give a finite number above 0")
         for name, value in {"tip_mass": self.tip_mass, "damping_ratio": self.damping_ratio, "beta": self.beta}.items():
-            if value is not None and not (_is_finite(value) and value >= 0.0):
+            if value is not None and not (is_number(value) and value >= 0.0):
                 raise ValueError(f"cane: {name} is {value}; give a finite number of 0 or more")
-        if not isinstance(self.segments, int | np.integer) or self.segments < 1:
+        if not is_whole(self.segments) or self.segments < 1:
             raise ValueError(f"cane: segments is {self.segments}; give a whole number, 1 or more")
         if self.damping_ratio is not None and self.beta is not None:
             raise ValueError(
@@ -168,10 +169,6 @@ class CaneBuilder:
             plausibility.check("cane", "mass", self.tip_mass, "tip_mass")
         if self.base == "clamped" and self.segments <= MODE_SEGMENTS:
             plausibility.check("cane", "frequency", self.first_mode() / (2.0 * np.pi), "frequency of its first mode")
-
-
-def _is_finite(value: object) -> bool:
-    return isinstance(value, int | float | np.integer | np.floating) and bool(np.isfinite(value))
 
 
 def _add_point_mass(body: dict, mass: float) -> None:
