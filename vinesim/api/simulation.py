@@ -495,10 +495,11 @@ class Simulation:
         here = np.zeros(len(model.tree_first), bool)
         here[trees] = True
         bodies = np.flatnonzero(here[model.body_tree])
-        rotation = state.joint_q[bodies]
+        rotation = state.joint_q.take(bodies, 0)
+        rate = state.joint_qd.take(bodies, 0)
         for name, bad, remedy in (
             ("joint_q", ~(abs(np.einsum("bi,bi->b", rotation, rotation) - 1.0) < 2e-3), "a unit quaternion xyzw"),
-            ("joint_qd", ~np.isfinite(state.joint_qd[bodies]).all(1), "three finite rates [rad/s]"),
+            ("joint_qd", ~np.isfinite(np.einsum("bi->b", rate)), "three finite rates [rad/s]"),
         ):
             if bad.any():
                 body = int(bodies[np.argmax(bad)])
