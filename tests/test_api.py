@@ -9,6 +9,7 @@ import subprocess
 import sys
 import urllib.error
 import urllib.request
+import warnings
 
 import numpy as np
 import pytest
@@ -470,3 +471,303 @@ def test_a_push_on_what_is_not_there_is_refused():
         simulation.push_robot("bob", "arm_left_7_link", (0.0, 1.0))
     with pytest.raises(Exception, match="no_such_link"):
         simulation.push_robot("bob", "no_such_link", (0.0, 0.0, 1.0))
+
+
+# ---------------------------------------------------------------- faults
+
+
+def test_a_tree_that_is_stopped_is_counted_and_warned_of_once():
+    simulation = vinesim.Simulation(vinesim.CaneBuilder())
+    simulation.step()
+    assert simulation.faults == {}
+    body = simulation.tip_body()
+    simulation.apply_wrench(body, (1e30, 0.0, 0.0))
+    with pytest.warns(RuntimeWarning, match="1 trees moved too fast, .* reset to rest .*trees_stopped") as told:
+        simulation.step(2)
+    assert [one.filename for one in told] == [__file__]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        simulation.apply_wrench(body, (1e30, 0.0, 0.0))
+        simulation.step(2)
+    assert simulation.faults == {"trees_stopped": 2}
+
+
+def test_a_tree_that_turns_too_fast_is_counted_and_warned_of():
+    """A base joint without a spring is let go at 100 rad/s, twice the limit."""
+    spinning = vinesim.Simulation(vinesim.CaneBuilder(base="pinned", segments=1), sleep=False)
+    spinning.state.joint_qd[0, 1] = 100.0
+    with pytest.warns(RuntimeWarning, match="turned faster than max_joint_rate") as told:
+        spinning.step()
+    assert set(spinning.faults) == {"trees_slowed"}
+    assert len(told) == 1
+
+
+# ---------------------------------------------------------------- impossible values
+
+
+def bunch_on_cane(mass=0.3, **fields):
+    tree = vinesim.CaneBuilder(length=0.5, damping_ratio=0.1).tree()
+    tree.add_bunch(len(tree.bodies) - 1, mass, **fields)
+    return vinesim.assemble([tree])
+
+
+def with_model_value(name, value):
+    model = bunch_on_cane()
+    getattr(model, name)[0] = value
+    return vinesim.Simulation(model)
+
+
+def with_state_value(simulation, name, value, call):
+    getattr(simulation.state, name)[3] = value
+    call(simulation)
+
+
+def rod(length=0.5, segments=4, bends=None, rest=frames.IDENTITY, **material):
+    tree = vinesim.TreeBuilder(frames.pose(np.array([0.0, 0.0, 1.0])))
+    wood = vinesim.RodMaterial(**{"modulus": 5e9, "density": 800.0, "damping": 0.01} | material)
+    tree.add_rod(-1, length, (0.004, 0.003), wood, segments, bends=bends, rest=rest)
+    return vinesim.Simulation(tree)
+
+
+NAN = float("nan")
+ON_A_CANE = [
+    (lambda s: s.cut(True), "body True does not exist; give 0 to 15, a whole number"),
+    (lambda s: s.cut(np.True_), "body True does not exist; give 0 to 15, a whole number"),
+    (lambda s: s.tip(False), "tree False does not exist; give 0 to 0, a whole number"),
+    (lambda s: s.step(True), "count is True; give a whole number of steps, 0 or more"),
+    (lambda s: s.apply_wrench(0, (True, False, True)), r"force is .*; give three finite numbers \[N\]"),
+    (lambda s: s.apply_wrench(0, (True, 0.0, 1.0)), r"force is .*; give three finite numbers \[N\]"),
+    (lambda s: s.apply_wrench(0, ("1", "2", "3")), r"force is .*; give three finite numbers \[N\]"),
+    (lambda s: s.apply_wrench(0, (1e39, 0.0, 0.0)), r"force is .*; give three finite numbers \[N\]"),
+    (lambda s: s.apply_wrench(0, (0, 0, 1), at=(NAN, 0, 0)), r"at is .*; give three finite numbers \[m\]"),
+    (
+        lambda s: with_state_value(s, "joint_q", 0.0, lambda s: s.wake()),
+        r"state.joint_q\[3\] is \[0.0, .*; give a unit q",
+    ),
+    (
+        lambda s: with_state_value(s, "joint_q", 0.0, lambda s: s.step()),
+        r"state.joint_q\[3\] is \[0.0, .*; give a unit q",
+    ),
+    (lambda s: with_state_value(s, "joint_q", (0, 0, 0, 2), lambda s: s.step()), "give a unit quaternion"),
+    (
+        lambda s: with_state_value(s, "joint_q", NAN, lambda s: s.step()),
+        r"state.joint_q\[3\] is \[nan, .*; give a unit",
+    ),
+    (
+        lambda s: with_state_value(s, "joint_qd", NAN, lambda s: s.step()),
+        r"state.joint_qd\[3\] is \[nan, .*finite rates",
+    ),
+    (lambda s: s.add_robot("vinebot", (True, 0, 0)), r"pose is \(True, 0, 0\); give \(x, y, yaw\)"),
+    (lambda s: s.add_robot("vinebot", name=3), "name is 3; give a text, or none"),
+    (lambda s: s.add_robot("vinebot").command_base(True, 0.0, 0.0), r"base velocity is \(True, 0.0\); give finite"),
+    (lambda s: s.add_robot("vinebot").command_position([True], ["head_1_joint"]), "'head_1_joint' is not finite; give"),
+]
+ALONE = [
+    (lambda: vinesim.Simulation(vinesim.CaneBuilder(), dt=True), "physics.dt is True; give a finite number"),
+    (lambda: vinesim.Simulation(vinesim.CaneBuilder(), detach="no"), "detach is 'no'; give True or False"),
+    (lambda: vinesim.Simulation(vinesim.CaneBuilder(), device=3), "device 3: give cpu, cuda or cuda:N"),
+    (lambda: vinesim.cane(length=True), "cane: length is True; give a finite number above 0"),
+    (lambda: vinesim.cane(segments=True), "cane: segments is True; give a whole number, 1 or more"),
+    (lambda: vinesim.cane(radius=(True, 0.004)), r"cane: radius\[0\] is True; give a finite number above 0"),
+    (lambda: vinesim.cane(tip_mass=True), "cane: tip_mass is True; give a finite number of 0 or more"),
+    (lambda: vinesim.cane(pose="here"), "cane: pose is here; give position .* and unit quaternion"),
+    (lambda: vinesim.cane(pose=(0, 0, 1, 0, 0, 0, 0)), "cane: pose is .*; give position .* and unit quaternion"),
+    (lambda: with_model_value("bunch_pull", -1.0), "bunch 0: bunch_pull is -1.0; give a number above 0"),
+    (lambda: with_model_value("bunch_bend", 0.0), "bunch 0: bunch_bend is 0.0; give a number above 0"),
+    (lambda: with_model_value("bunch_variety", 99), "bunch 0: bunch_variety is 99; give 0 to"),
+    (lambda: with_model_value("bunch_body", 99), "bunch 0: bunch_body is 99; give 0 to"),
+    (lambda: with_model_value("tree_pose", 0.0), "root frame's rotation .*; give a unit quaternion xyzw"),
+    (lambda: with_model_value("body_organ", 99), "body 0 of tree 0: organ 99; give a member of vinesim.Organ"),
+    (lambda: bunch_on_cane(pull=-1.0), "bunch on body 15: pull is -1.0; give a finite number above 0"),
+    (lambda: bunch_on_cane(bend=True), "bunch on body 15: bend is True; give a finite number above 0"),
+    (lambda: bunch_on_cane(pul=3.0), "bunch on body 15 has no field 'pul'; it has: pull, bend"),
+    (lambda: bunch_on_cane(mass=True), "bunch of True kg, .* give a finite mass above 0"),
+    (lambda: bunch_on_cane(count=2.5), "bunch of 0.3 kg, 2.5 berries; give a finite mass above 0"),
+    (lambda: bunch_on_cane(seed=-1), "bunch on body 15: seed is -1; give a whole number from 0"),
+    (lambda: rod(length=NAN), "rod of length nan m, .*: all must be positive and finite"),
+    (lambda: rod(segments=2.5), "rod of .* 2.5 segments, .* segments a whole number"),
+    (lambda: rod(damping=-1.0), "rod of .*damping=-1.0.*: all must be positive and finite"),
+    (lambda: rod(shear_modulus=NAN), "rod of .*shear_modulus=nan.*: all must be positive and finite"),
+    (lambda: rod(bends=np.zeros((2, 4))), r"rod: bends has the shape \(2, 4\); give \[4, 4\]"),
+    (lambda: rod(rest=np.zeros(4)), "rest rotation .*; give a unit quaternion xyzw"),
+    (lambda: vinesim.load_scene("demo", seed=True), "seed is True: give a whole number of 0 or more"),
+    (lambda: vinesim.load_scene("demo", seed=1.5), "seed is 1.5: give a whole number of 0 or more"),
+    (lambda: vinesim.look_at((NAN, 0, 0), (1, 0, 0)), "cannot look from .*; give two points"),
+    (lambda: next(iter(vinesim.sweep(abs, [1], workers=True))), "workers is True; give a whole number of 1 or more"),
+    (lambda: vinesim.reachable_grasps("demo", reach=NAN), r"reach is nan; give a finite number above 0 \[m\]"),
+    (lambda: vinesim.reachable_grasps("demo", spawn=True), "spawn is True; give a whole number"),
+]
+
+
+@pytest.mark.parametrize(("call", "message"), [pytest.param(*row, id=row[1][:40]) for row in ON_A_CANE])
+def test_calls_with_impossible_values_are_refused_and_the_world_goes_on(call, message):
+    simulation = vinesim.Simulation(vinesim.CaneBuilder(), sleep=False)
+    before = simulation.state.joint_q[3].copy()
+    with pytest.raises(ValueError, match=message) as error:
+        call(simulation)
+    assert "\n" not in str(error.value)
+    simulation.state.joint_q[3] = before
+    simulation.state.joint_qd[3] = 0.0
+    simulation.step()
+    assert simulation.faults == {}
+
+
+@pytest.mark.parametrize(("call", "message"), [pytest.param(*row, id=row[1][:40]) for row in ALONE])
+def test_impossible_values_are_refused_in_one_line(call, message):
+    with pytest.raises(ValueError, match=message) as error:
+        call()
+    assert "\n" not in str(error.value)
+
+
+# ---------------------------------------------------------------- experiments without a scene
+
+MID_WIRE = 4.0 * 900.0 / 2.0
+"""Stiffness of a string of 900 N and 2 m at its middle [N/m]."""
+
+
+@pytest.mark.parametrize(("wire", "stiffness"), [(None, 2000.0), (0, 1.0 / (1.0 / 2000.0 + 1.0 / MID_WIRE))])
+def test_a_tie_carries_a_bar_on_its_spring_and_the_string_law_of_the_wire(wire, stiffness):
+    """A bar on a hinge, tied below its centre of mass: the tie carries the weight, m g = k d."""
+    bar = vinesim.CaneBuilder(length=1.0, radius=0.01, base="pinned", segments=1)
+    model = vinesim.assemble(
+        [bar],
+        wires=[vinesim.Wire((0.5, -1.0, 1.0), (0.5, 1.0, 1.0), tension=900.0)],
+        ties=[vinesim.Tie(tree=0, along=0.5, wire=wire, stiffness=2000.0)],
+    )
+    simulation = vinesim.Simulation(model, sleep=False)
+    simulation.step(1000)
+    weight = G * 800.0 * np.pi * 0.01**2
+    assert 1.0 - simulation.tip()[2] == pytest.approx(2.0 * weight / stiffness, rel=0.01)
+
+
+def test_the_shear_modulus_of_a_cane_sets_its_twist():
+    """Torsion of a round rod: angle = T L / G J, less half a segment."""
+    cane = vinesim.CaneBuilder(shear_modulus=1e9, damping_ratio=0.5, shape="equilibrium")
+    simulation = vinesim.Simulation(cane, sleep=False)
+    body = simulation.tip_body()
+    before = simulation.body_pose(body)
+    simulation.apply_wrench(body, (0.0, 0.0, 0.0), (0.01, 0.0, 0.0))
+    simulation.step(600)
+    turned = frames.log(frames.multiply(frames.conjugate(before[3:]), simulation.body_pose(body)[3:]))
+    polar = np.pi * 0.004**4 / 2.0
+    assert turned[0] == pytest.approx(0.01 * (1.0 - 0.5 / 16.0) / (1e9 * polar), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("shape", "size", "reach"),
+    [("sphere", (0.03,), 0.03), ("capsule", (0.02, 0.2), 0.02), ("box", (0.06, 0.04, 0.05), 0.02)],
+)
+def test_a_pusher_bends_a_cane_by_the_force_of_beam_theory(shape, size, reach):
+    """A clamped beam that is bent by d at the distance a from its clamp: F = 3 EI d / a^3."""
+    cane = vinesim.CaneBuilder(segments=32, damping_ratio=0.5, shape="equilibrium")
+    simulation = vinesim.Simulation(cane, sleep=False)
+    gap = 0.004 + reach
+    pusher = simulation.add_pusher(shape=shape, size=size, position=(0.5, -gap - 0.01, 1.0))
+    simulation.step(20)
+    np.testing.assert_allclose(pusher.position, (0.5, -gap - 0.01, 1.0), atol=1e-5)
+    assert not pusher.force.any()
+    pusher.follow([(0.5, -gap, 1.0), (0.5, -gap + 0.02, 1.0)], speed=0.05)
+    steps = 0
+    while not pusher.is_done:
+        simulation.step()
+        steps += 1
+    assert steps == round(0.03 / 0.05 / simulation.dt)
+    simulation.step(300)
+    bent = pusher.position[1] + gap
+    near = 0.5 - (0.5 * size[0] if shape == "box" else 0.0)  # a box touches with its edge, which the cane bends around
+    assert -pusher.force[1] == pytest.approx(3.0 * EI * bent / near**3, rel=0.05)
+    assert {contact.actor for contact in simulation.contacts} == {pusher.name} == {"pusher_0"}
+
+
+def test_a_pusher_stalls_at_its_force():
+    simulation = vinesim.Simulation(vinesim.CaneBuilder(radius=0.02, damping_ratio=0.5, shape="equilibrium"))
+    pusher = simulation.add_pusher(position=(0.3, -0.05, 1.0), force=5.0)
+    pusher.follow((0.3, 0.5, 1.0), speed=0.1)
+    while not pusher.is_done:
+        simulation.step()
+    simulation.step(200)
+    assert pusher.position[1] < 0.0
+    assert -pusher.force[1] == pytest.approx(5.0, rel=0.01)
+    simulation.remove_pusher(pusher.name)
+    simulation.step(500)
+    assert abs(simulation.tip()[1]) < 1e-3
+    with pytest.raises(UsageError, match="no pusher 'pusher_0'; there are: none"):
+        simulation.remove_pusher(pusher.name)
+
+
+def test_boxes_fall_and_carry_and_go():
+    model = vinesim.assemble([vinesim.CaneBuilder()], boxes=[vinesim.Box(position=(2.0, 0.0, 0.0))])
+    simulation = vinesim.Simulation(model)
+    second = simulation.add_box(vinesim.Box(position=(2.0, 0.0, 0.5), mass=1.0))
+    simulation.step(300)
+    assert sorted(simulation.boxes) == [0, second] == [0, 1]
+    assert simulation.box_pose(0)[2] == pytest.approx(0.0, abs=2e-3)
+    assert simulation.box_pose(second)[2] == pytest.approx(0.25, abs=5e-3)  # on the walls of the first
+    simulation.remove_box(0)
+    simulation.step(300)
+    assert simulation.box_pose(second)[2] == pytest.approx(0.0, abs=2e-3)
+    with pytest.raises(UsageError, match="no box 0; there are: 1"):
+        simulation.box_pose(0)
+
+
+def test_a_blade_on_a_pusher_cuts_the_cane_in_its_mouth():
+    simulation = vinesim.Simulation(vinesim.CaneBuilder(damping_ratio=0.1, shape="equilibrium"))
+    pusher = simulation.add_pusher(position=(0.5, -0.06, 1.0))
+    blade = simulation.add_blade(pusher.name, "body", (0, 0.06, 0, 0, 0, 0, 1), size=(0.02, 0.04, 0.04))
+    blade.close()
+    simulation.step(2)
+    (cut,) = simulation.detachments
+    assert (cut.cause, cut.actor) == ("blade", pusher.name)
+
+
+def test_a_wind_that_is_set_bends_a_cane_and_ends():
+    model = vinesim.cane(damping_ratio=0.3, shape="equilibrium")
+    model.body_drag[:] = 0.01
+    simulation = vinesim.Simulation(model, sleep=False)
+    simulation.wind = wind = vinesim.Wind((0.0, 4.0, 0.0))
+    simulation.step(500)
+    assert simulation.wind is wind
+    assert simulation.tip()[1] > 0.05
+    simulation.wind = None
+    simulation.step(1500)
+    assert abs(simulation.tip()[1]) < 2e-3
+
+
+BUILDERS = [
+    (lambda _: vinesim.Wire((0, 0, 1), (0, 0, 1)), "wire: start and end are .* that differ"),
+    (lambda _: vinesim.Wire((0, 0, 1), (0, 1, 1), tension=-1.0), r"wire: tension is -1.0; give .* 0 or more \[N\]"),
+    (lambda _: vinesim.Wire((0, 0, NAN), (0, 1, 1)), "wire: start is .*; give three finite numbers"),
+    (lambda _: vinesim.Tie(along=True), "tie: along is True; give a finite number of 0 or more"),
+    (lambda _: vinesim.Tie(along=0.1, stiffness=0.0), "tie: stiffness is 0.0; give a finite number above 0"),
+    (lambda _: vinesim.Box(mass=-1.0), "box: mass is -1.0; give a finite number above 0"),
+    (lambda _: vinesim.Box(size=(1, 1, 0)), "box: size is .*; give three lengths above 0"),
+    (lambda _: vinesim.Box(position=(0, 0, 0, 0, 0, 0, 0)), "box: position is .* unit quaternion"),
+    (lambda _: vinesim.assemble([vinesim.CaneBuilder()], ties=[vinesim.Tie(along=1.2)]), "tree 0 is 1.000 m long"),
+    (
+        lambda _: vinesim.assemble([vinesim.CaneBuilder()], ties=[vinesim.Tie(along=0.2, wire=0)]),
+        "wire 0 does not exist",
+    ),
+    (lambda _: vinesim.assemble([], ties=[vinesim.Tie(along=0.2)]), "tie: tree 0 does not exist; there is none"),
+    (lambda _: vinesim.assemble([], wires=[1.0]), "wires contain a float; give vinesim.Wire"),
+    (lambda _: vinesim.cane(shear_modulus=-1.0), "cane: shear_modulus is -1.0; give a finite number above 0"),
+    (lambda s: s.add_pusher(shape="cone", position=(0, 0, 1)), "shape is 'cone'; give one of: sphere, capsule, box"),
+    (lambda s: s.add_pusher(size=(0.1, 0.1), position=(0, 0, 1)), r"size is .*; a sphere has \(radius,\)"),
+    (lambda s: s.add_pusher(position=(0, 0, NAN)), "position is .*; give three finite numbers"),
+    (lambda s: s.add_pusher(position=(0, 0, 1), force=-1.0), "force is -1.0; give a finite number above 0"),
+    (lambda s: s.add_pusher(position=(0, 0, 1), mass=True), "mass is True; give a finite number above 0"),
+    (lambda s: s.add_pusher(position=(3, 0, 1)).follow((0, 0), 0.1), "path is .*; give a point"),
+    (lambda s: s.add_pusher(position=(3, 0, 1)).follow((0, 0, 1), -0.1), "speed is -0.1; give a finite number above 0"),
+    (lambda s: s.add_box((0, 0, 0)), "box is a tuple; give vinesim.Box"),
+    (lambda s: s.remove_box(True), "no box True; there are: none"),
+    (lambda s: s.add_blade("bob", "body", size=(1, 1, 1)), "no robot or pusher 'bob'; there are: none"),
+    (lambda s: setattr(s, "wind", 3.0), "wind is a float; give vinesim.Wind, or None"),
+    (lambda _: vinesim.Wind((NAN, 0, 0)), "mean wind .*: give three finite numbers"),
+    (lambda _: vinesim.Wind((1, 0, 0), gusts=-1.0), "gusts -1.0 m/s"),
+]
+
+
+@pytest.mark.parametrize(("call", "message"), [pytest.param(*row, id=row[1][:40]) for row in BUILDERS])
+def test_impossible_experiments_are_refused_in_one_line(call, message):
+    with pytest.raises(ValueError, match=message) as error:
+        call(vinesim.Simulation(vinesim.CaneBuilder()))
+    assert "\n" not in str(error.value)

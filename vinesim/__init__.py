@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from vinesim.api.picking import PickAttempt as PickAttempt
     from vinesim.api.picking import attempt_pick as attempt_pick
     from vinesim.api.picking import reachable_grasps as reachable_grasps
+    from vinesim.api.pusher import Pusher as Pusher
     from vinesim.api.recording import RecordedMessage as RecordedMessage
     from vinesim.api.recording import Recording as Recording
     from vinesim.api.sensors import Camera as Camera
@@ -35,8 +36,12 @@ if TYPE_CHECKING:
     from vinesim.api.sweep import sweep as sweep
     from vinesim.core import frames as frames
     from vinesim.core.errors import UsageError as UsageError
+    from vinesim.interaction.detachment import Blade as Blade
     from vinesim.net.server.server import Server as Server
+    from vinesim.plants.rollout import Rollout as Rollout
     from vinesim.robot.drives.controlled_robot import Robot as Robot
+    from vinesim.scene.builder import RodMaterial as RodMaterial
+    from vinesim.scene.builder import TreeBuilder as TreeBuilder
     from vinesim.scene.cane import CaneBuilder as CaneBuilder
     from vinesim.scene.cane import assemble as assemble
     from vinesim.scene.cane import cane as cane
@@ -49,10 +54,16 @@ if TYPE_CHECKING:
     from vinesim.scene.spec import Scene as Scene
     from vinesim.scene.spec import load_scene as load_scene
     from vinesim.scene.state import State as State
+    from vinesim.scene.surroundings import Box as Box
+    from vinesim.scene.surroundings import Tie as Tie
+    from vinesim.scene.surroundings import Wire as Wire
+    from vinesim.scene.wind import Wind as Wind
 
 _MODULES = {
-    "CaneBuilder": "scene.cane",
+    "Blade": "interaction.detachment",
+    "Box": "scene.surroundings",
     "Camera": "api.sensors",
+    "CaneBuilder": "scene.cane",
     "Client": "api.client",
     "Energy": "api.energy",
     "Grasp": "api.picking",
@@ -64,14 +75,21 @@ _MODULES = {
     "Page": "api.page",
     "PhysicsParameters": "scene.physics_parameters",
     "PickAttempt": "api.picking",
+    "Pusher": "api.pusher",
     "RecordedMessage": "api.recording",
     "Recording": "api.recording",
     "Robot": "robot.drives.controlled_robot",
+    "RodMaterial": "scene.builder",
+    "Rollout": "plants.rollout",
     "Scene": "scene.spec",
     "Server": "net.server.server",
     "Simulation": "api.simulation",
     "State": "scene.state",
+    "Tie": "scene.surroundings",
+    "TreeBuilder": "scene.builder",
     "UsageError": "core.errors",
+    "Wind": "scene.wind",
+    "Wire": "scene.surroundings",
     "assemble": "scene.cane",
     "attempt_pick": "api.picking",
     "cane": "scene.cane",
@@ -87,6 +105,8 @@ _MODULES = {
 """Module of each public name, relative to the package ``vinesim``."""
 
 __all__ = [
+    "Blade",
+    "Box",
     "Camera",
     "CaneBuilder",
     "Client",
@@ -100,14 +120,21 @@ __all__ = [
     "Page",
     "PhysicsParameters",
     "PickAttempt",
+    "Pusher",
     "RecordedMessage",
     "Recording",
     "Robot",
+    "RodMaterial",
+    "Rollout",
     "Scene",
     "Server",
     "Simulation",
     "State",
+    "Tie",
+    "TreeBuilder",
     "UsageError",
+    "Wind",
+    "Wire",
     "__version__",
     "assemble",
     "attempt_pick",

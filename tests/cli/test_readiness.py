@@ -28,6 +28,6 @@ def test_the_line_says_what_the_first_waiting_client_does() -> None:
 
 
 def test_warnings_do_not_greet_a_newcomer() -> None:
-    warning = "2026-01-01 00:00:00,000 WARNING vinesim.client.status: 26 steps were skipped"
+    warning = "2026-01-01 00:00:00,000 WARNING vinesim.client.faults: 26 steps were skipped"
     assert progress_of({"picker": client(warning)}, {}) == ""
     assert progress_of({"picker": client(warning)}, {"picker": {"sensors_awaited": []}}) == ""

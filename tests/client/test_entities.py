@@ -11,7 +11,7 @@ import pytest
 
 from tests.support.shared_vineyard import World, cart, vineyard
 from vinesim.client.client import Client
-from vinesim.client.status import count_faults
+from vinesim.client.faults import count_faults
 from vinesim.client.tasks.entities import BOX_SIZE, WorldEditor
 from vinesim.core import frames
 from vinesim.net.transport.memory_bus import MemoryHub

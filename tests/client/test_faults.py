@@ -12,10 +12,11 @@ from tests.support.contact_scenes import cane
 from vinesim.cli.client_session import status_line
 from vinesim.cli.robot_client import complete_report
 from vinesim.client.client import Client
+from vinesim.client.faults import DESCRIPTIONS
 from vinesim.client.pace import RealTime
 from vinesim.client.processes.robot_processes import loop_status, network_status
 from vinesim.client.rate_loop import RateLoop
-from vinesim.client.status import DESCRIPTIONS, Status
+from vinesim.client.status import Status
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.net.replication.clock_sync import Ping
 from vinesim.net.transport.memory_bus import MemoryHub

@@ -17,8 +17,8 @@ import trimesh
 from tests.support.contact_scenes import cane
 from tests.support.waiting import wait
 from vinesim.client.client import Client
+from vinesim.client.faults import count_faults
 from vinesim.client.remote.mesh_exchange import MeshExchange
-from vinesim.client.status import count_faults
 from vinesim.core import frames
 from vinesim.net.codec.meshes import MAX_PART, MeshPart, decode_request, encode_part
 from vinesim.net.server.server import Server

@@ -196,7 +196,7 @@ def test_the_log_has_each_kind_of_refusal_once(caplog):
     assert len(logged) == 6, logged
     assert logged[0] == (
         "refused a command of BaseVelocity, further ones of this kind are only counted: "
-        "anna: base velocity (nan, 0.1) is not finite"
+        "anna: base velocity is (nan, 0.1); give finite numbers [m/s, rad/s]"
     )
     for number in range(3 * MAX_LOGGED):
         commanded.queue = [ForwardCommand(f"controller_{number}", np.zeros(2))]

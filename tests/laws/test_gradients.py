@@ -134,3 +134,16 @@ def test_stiffness_and_damping_of_a_cane_from_a_noisy_track() -> None:
     assert example["beta"] == pytest.approx(0.03, rel=0.02)
     assert example["found"].fun == pytest.approx(0.5, rel=0.1)  # the residual is the noise
     assert example["found"].nfev <= 30
+
+
+def test_one_descent_ends_in_a_wrong_minimum_and_the_remedies_in_the_docs_do_not() -> None:
+    """A modulus five times too high on a track of three cycles: a growing horizon and several starts find the truth."""
+    text = (pathlib.Path(__file__).parents[2] / "docs/gradients.md").read_text()
+    example: dict = {}
+    exec(re.findall(r"```python\n(.*?)```", text, re.S)[1], example)
+    modulus, loss = example["plain"]
+    assert modulus > 8.0
+    assert loss > 100.0
+    for found in (example["grown"], example["best"]):
+        assert found[0] == pytest.approx(4.0, rel=0.005)
+        assert found[1] == pytest.approx(0.5, rel=0.1)  # the residual is the noise

@@ -15,6 +15,8 @@ import numpy as np
 
 from vinesim.client.tasks import planning
 from vinesim.client.tasks.start_poses import start_pose
+from vinesim.core.errors import UsageError
+from vinesim.core.numbers import checked_number, is_whole
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.pick import PickBunch, PickPlan
@@ -65,6 +67,9 @@ def reachable_grasps(scene: Scene | str | pathlib.Path, spawn: int = 0, reach: f
     ``spawn``: index of the start place. Bunches that a hand can reach are listed even if the hand has no room around
     them.
     """
+    checked_number("reach", reach, "m", positive=True, error=UsageError)
+    if not is_whole(spawn):
+        raise UsageError(f"spawn is {spawn}; give a whole number, the index of a start place")
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
     found = planning.freest_bases(generate(scene), start_pose(scene, spawn)[:2], reach)
     return [Grasp(*one) for one in found]

@@ -16,6 +16,7 @@ import numpy as np
 
 from vinesim.api.simulation import Simulation, base_pose
 from vinesim.core.errors import UsageError
+from vinesim.core.numbers import as_numbers
 from vinesim.perception.clouds import picture_cloud, scan_cloud
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.terrain import Terrain
@@ -181,10 +182,10 @@ class Lidar:
 def look_at(eye: Sequence[float] | np.ndarray, target: Sequence[float] | np.ndarray) -> np.ndarray:
     """Returns the pose [7] of the optical frame of an upright camera at ``eye`` [3] m that looks at ``target`` [3]
     m."""
-    start = np.asarray(eye, float)
-    end = np.asarray(target, float)
-    if start.shape != (3,) or end.shape != (3,) or np.linalg.norm(end - start) < 1e-6:
-        raise UsageError(f"cannot look from {start.tolist()} at {end.tolist()}; give two points [3] m that differ")
+    start = as_numbers(eye)
+    end = as_numbers(target)
+    if start.shape != (3,) or end.shape != (3,) or not 1e-6 <= np.linalg.norm(end - start) < np.inf:
+        raise UsageError(f"cannot look from {eye} at {target}; give two points [3] m that differ")
     return images.look_at(start, end)
 
 

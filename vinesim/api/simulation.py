@@ -11,29 +11,34 @@ from __future__ import annotations
 
 import functools
 import pathlib
+import warnings
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import msgspec
 import numpy as np
 
 from vinesim.api.energy import Energy, Momentum, energy, momentum
+from vinesim.api.pusher import Pusher, checked_shape
+from vinesim.client.faults import FaultLog, occurred
 from vinesim.core import frames, progress
 from vinesim.core.errors import UsageError, checked_index
+from vinesim.core.numbers import as_numbers, checked_vector, is_whole
+from vinesim.interaction.detachment import Blade
 from vinesim.kernels.compilation import PHYSICS_PACKAGES, compile_kernels
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.builder import TreeBuilder
 from vinesim.scene.cane import CaneBuilder, assemble
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.spec import Scene, load_scene
 from vinesim.scene.state import State
+from vinesim.scene.surroundings import Box, main_axis
 from vinesim.scene.terrain import Terrain, on_ground
-from vinesim.scene.values import Contact, Detachment, Snapshot
-from vinesim.scene.wind import wind_of
+from vinesim.scene.values import Contact, Detachment, RigidBox, Snapshot
+from vinesim.scene.wind import Wind, wind_of
 from vinesim.wind.sway import Sway
 from vinesim.world import Physics
 
@@ -83,6 +88,8 @@ class Simulation:
             detach: whether bunches detach when they are pulled too hard.
             device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``, for stepping plants and for cameras and lidars.
         """
+        if not isinstance(detach, bool):
+            raise UsageError(f"detach is {detach!r}; give True or False")
         _compile_kernels()
         self.scene: Scene | None = None
         """The simulated scene; None for a model or canes."""
@@ -103,6 +110,8 @@ class Simulation:
         """The underlying physics, for functions that this class does not offer."""
         self.robots: dict[str, Robot] = {}
         """Robots by name; their commands take effect in the next step."""
+        self.pushers: dict[str, Pusher] = {}
+        """Bodies of :meth:`add_pusher`, by name."""
         self._robots_added = 0
         if self.scene is not None:
             self.physics.wind = wind_of(self.scene)
@@ -111,21 +120,28 @@ class Simulation:
         self._detachments: list[Detachment] = []
         self._primitives: Primitives | None = None
         self._sway = Sway(model)
+        self._fault_log = FaultLog(_warn_caller_of_step)
         self.physics.sleep_monitor.wake_unbalanced()
 
     # ------------------------------------------------------------------ time
 
     def step(self, count: int = 1) -> None:
         """Advance by ``count`` steps of :attr:`dt`. Wrenches of :meth:`apply_wrench` and :meth:`push_robot` act in all
-        these steps and then end."""
-        if not isinstance(count, int | np.integer) or count < 0:
+        these steps and then end.
+
+        At the first fault of each kind (see :attr:`faults`), a ``RuntimeWarning`` says what happened.
+        """
+        if not is_whole(count) or count < 0:
             raise UsageError(f"count is {count}; give a whole number of steps, 0 or more")
+        self._check_joints(self.physics.plants.awake)
         self._detachments = []
         for name in self.robots.keys() - set(self.physics.rigid.robots):  # robots that are no longer in the physics
             self._forget_robot(name)
         for _ in range(count):
             for robot in self.robots.values():
                 robot.control(self.physics.time)
+            for pusher in self.pushers.values():
+                pusher.control()
             self.physics.step()
             self._detachments += self.physics.detachments
         for body, before in self._loads.items():
@@ -136,6 +152,7 @@ class Simulation:
         for robot, link in self._pushed:
             self.physics.rigid.apply_wrench(robot, link, np.zeros(3))
         self._pushed.clear()
+        self._fault_log.update(self.faults, self.time)
 
     @property
     def time(self) -> float:
@@ -179,6 +196,17 @@ class Simulation:
         """Bunches and canes that left their plant in the last call of :meth:`step`."""
         return tuple(self._detachments)
 
+    @property
+    def faults(self) -> dict[str, int]:
+        """Number of faults since the start, by kind; empty if none occurred. After a fault the motion is not that of
+        the model: results may be wrong.
+
+        Kinds: ``trees_stopped`` and ``robots_stopped`` (too fast or not finite, so put at rest), ``trees_slowed`` (in
+        how many steps a joint of a tree exceeded ``max_joint_rate``), ``contacts_dropped`` (more than the capacity),
+        ``geoms_skipped`` (static objects near a tree, more than ``max_static_geoms_per_tree``), ``grasps_refused``.
+        """
+        return occurred(self.physics.faults)
+
     def energy(self, tree: int | None = None) -> Energy:
         """Returns the kinetic, elastic and gravitational energy [J] of the plants, or of one tree."""
         self.physics.update_kinematics()
@@ -205,14 +233,7 @@ class Simulation:
     def tip_body(self, tree: int = 0) -> int:
         """Returns the index of the last body of a tree's main axis. From its root, the main axis continues with the
         first child of each body that is a segment of cane."""
-        bodies = self.model.bodies_of(self._tree(tree))
-        body = bodies.start
-        while True:
-            above = self.model.body_parent[bodies] == body
-            following = np.flatnonzero(above & (self.model.body_organ[bodies] == int(Organ.CANE)))
-            if len(following) == 0:
-                return body
-            body = bodies.start + int(following[0])
+        return main_axis(self.model, self._tree(tree))[-1]
 
     def snapshot(self) -> Snapshot:
         """Returns the whole world at the current time, for sensors. The returned snapshot does not change when the
@@ -222,8 +243,12 @@ class Simulation:
     # ------------------------------------------------------------------ actions
 
     def wake(self, tree: int | None = None) -> None:
-        """Wake a tree, or all trees, for the next step. Call it after joint rotations were written."""
+        """Wake a tree, or all trees, for the next step. Call it after joint rotations were written.
+
+        Raises :class:`UsageError` if a joint rotation is not a unit quaternion, or a joint rate is not finite.
+        """
         trees = np.arange(len(self.model.tree_first)) if tree is None else np.array([self._tree(tree)])
+        self._check_joints(trees)
         self.physics.wake(trees)
 
     def apply_wrench(
@@ -242,12 +267,12 @@ class Simulation:
             at: [3] m in the world, the point where the force acts; the body's centre of mass unless given.
         """
         body = self._body(body)
-        force = _vector("force", force, "N")
-        torque = _vector("torque", torque, "N m")
+        force = checked_vector("force", force, "N", UsageError)
+        torque = checked_vector("torque", torque, "N m", UsageError)
         pose = self.body_pose(body)
         point = pose[:3] + frames.rotate(pose[3:], self.physics.plants.body_com[body].astype(float))
         if at is not None:
-            point = _vector("at", at, "m")
+            point = checked_vector("at", at, "m", UsageError)
         load = self.physics.plants.body_load
         self._loads.setdefault(body, load[body].copy())
         load[body] += np.concatenate([force, torque + np.cross(point - pose[:3], force)]).astype(load.dtype)
@@ -272,10 +297,12 @@ class Simulation:
         """
         if robot not in self.robots:
             raise UsageError(f"no robot {robot!r}; there are: {', '.join(self.robots) or 'none'}")
-        force = _vector("force", force, "N")
-        torque = _vector("torque", torque, "N m")
+        force = checked_vector("force", force, "N", UsageError)
+        torque = checked_vector("torque", torque, "N m", UsageError)
         if at is not None:
-            torque = torque + np.cross(_vector("at", at, "m") - self.physics.rigid.link_centre(robot, link), force)
+            torque = torque + np.cross(
+                checked_vector("at", at, "m", UsageError) - self.physics.rigid.link_centre(robot, link), force
+            )
         self.physics.rigid.apply_wrench(robot, link, force, torque)
         self._pushed.add((robot, link))
 
@@ -318,9 +345,7 @@ class Simulation:
         """
         described = load_description(robot, base=base)
         index = self._robots_added
-        name = name or f"robot_{index}"
-        if name in self.physics.rigid.robots:
-            raise UsageError(f"robot {name!r} exists already; give another name")
+        name = self._free_name(name, f"robot_{index}")
         self.robots[name] = added = Robot(
             self.physics.rigid, described, name, index, base_pose(pose, self.model.terrain)
         )
@@ -334,6 +359,117 @@ class Simulation:
             raise UsageError(f"no robot {name!r}; there are: {', '.join(self.robots) or 'none'}")
         self.robots[name].remove()
         self._forget_robot(name)
+
+    def add_pusher(
+        self,
+        *,
+        shape: Literal["sphere", "capsule", "box"] = "sphere",
+        size: Sequence[float] = (0.02,),
+        position: Sequence[float] | np.ndarray,
+        mass: float = 1.0,
+        force: float = 50.0,
+        name: str = "",
+    ) -> Pusher:
+        """Add a rigid body that :meth:`Pusher.follow` drives along a path with a limited force. It stays where it is
+        until then, and meets plants, robots and boxes.
+
+        Args:
+            shape: ``sphere``, ``capsule`` (along its z axis) or ``box``.
+            size: (radius,), (radius, length of the axis) or three edges [m].
+            position: [3] m, its centre, or [7] centre and quaternion xyzw.
+            mass: [kg]; it costs no force to carry.
+            force: [N] largest force of the drive along each axis of the world.
+            name: unique name, also of the ``actor`` in :attr:`contacts`; ``pusher_0``, ``pusher_1``, ... unless given.
+        """
+        pose = checked_shape(shape, size, position, mass, force)
+        index = self._robots_added
+        name = self._free_name(name, f"pusher_{index}")
+        self.pushers[name] = added = Pusher(self.physics, name, index, shape, size, pose, mass, force)
+        self._robots_added += 1
+        return added
+
+    def remove_pusher(self, name: str) -> None:
+        """Remove a pusher and its blades."""
+        if name not in self.pushers:
+            raise UsageError(f"no pusher {name!r}; there are: {', '.join(self.pushers) or 'none'}")
+        self.physics.remove_robot(name)
+        del self.pushers[name]
+
+    def add_blade(
+        self,
+        actor: str,
+        link: str,
+        pose: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+        *,
+        size: Sequence[float],
+    ) -> Blade:
+        """Attach a cutter to a robot's link, or to the link ``body`` of a pusher. :meth:`Blade.close` cuts the wood
+        between its blades in the next step. The cutters of a robot's files are there already
+        (:meth:`~vinesim.robot.drives.controlled_robot.Robot.cutter_blades`).
+
+        Args:
+            actor: name of the robot or pusher.
+            link: name of its link.
+            pose: [7] centre of the mouth in the link's frame: x along the blades, y from one blade to the other.
+            size: [3] m, edges of the mouth along x, y and z.
+        """
+        if actor not in self.robots and actor not in self.pushers:
+            there = ", ".join([*self.robots, *self.pushers]) or "none"
+            raise UsageError(f"no robot or pusher {actor!r}; there are: {there}")
+        edges = checked_vector("size", size, "m", UsageError)
+        if not (edges > 0.0).all():
+            raise UsageError(f"size is {size}; give three edges above 0 [m]")
+        return self.physics.add_blade(actor, link, frames.checked_pose("pose", pose, UsageError), 0.5 * edges)
+
+    def add_box(self, box: Box) -> int:
+        """Add an open box, which falls if nothing holds it, and return its number."""
+        if not isinstance(box, Box):
+            raise UsageError(f"box is a {type(box).__name__}; give vinesim.Box")
+        number = max(self.boxes, default=-1) + 1
+        self.physics.rigid.add_box(number, RigidBox(box.pose, np.asarray(box.size, float), box.mass))
+        return number
+
+    def remove_box(self, number: int) -> None:
+        """Remove a box; objects in it or on it fall."""
+        self._box(number)
+        self.physics.rigid.remove_box(int(number))
+
+    def box_pose(self, number: int) -> np.ndarray:
+        """Returns the pose [7] of the middle of a box's underside in the world at the current time."""
+        return self.boxes[self._box(number)]
+
+    @property
+    def boxes(self) -> dict[int, np.ndarray]:
+        """Poses [7] of the middles of the undersides of all boxes in the world at the current time, by number."""
+        rigid = self.physics.rigid
+        rows = zip(rigid.visuals(), rigid.visual_q(), strict=True)
+        return {one.index: pose.astype(float) for one, pose in rows if one.name.startswith("box/")}
+
+    @property
+    def wind(self) -> Wind | None:
+        """The wind; None for calm air. It may be set between steps; the air then changes to the new wind within two
+        seconds."""
+        return self.physics.wind
+
+    @wind.setter
+    def wind(self, wind: Wind | None) -> None:
+        if wind is not None and not isinstance(wind, Wind):
+            raise UsageError(f"wind is a {type(wind).__name__}; give vinesim.Wind, or None for calm air")
+        self.physics.wind = wind
+
+    def _free_name(self, name: str, usual: str) -> str:
+        if not isinstance(name, str):
+            raise UsageError(f"name is {name!r}; give a text, or none")
+        name = name or usual
+        if name in self.physics.rigid.robots:
+            raise UsageError(f"robot {name!r} exists already; give another name")
+        return name
+
+    def _box(self, number: int) -> int:
+        there = self.boxes
+        if not is_whole(number) or number not in there:
+            raise UsageError(f"no box {number}; there are: {', '.join(map(str, there)) or 'none'}")
+        return int(number)
 
     def _forget_robot(self, name: str) -> None:
         del self.robots[name]
@@ -359,6 +495,27 @@ class Simulation:
     def _one(self, tree: int | None) -> np.ndarray | None:
         return None if tree is None else np.array([self._tree(tree)])
 
+    def _check_joints(self, trees: np.ndarray) -> None:
+        """Raise :class:`UsageError` for the first body of ``trees`` [k] with an impossible joint rotation or rate: a
+        user may have written it."""
+        if len(trees) == 0:
+            return
+        model = self.model
+        state = self.physics.state
+        here = np.zeros(len(model.tree_first), bool)
+        here[trees] = True
+        bodies = np.flatnonzero(here[model.body_tree])
+        rotation = state.joint_q.take(bodies, 0)
+        rate = state.joint_qd.take(bodies, 0)
+        for name, bad, remedy in (
+            ("joint_q", ~(abs(np.einsum("bi,bi->b", rotation, rotation) - 1.0) < 2e-3), "a unit quaternion xyzw"),
+            ("joint_qd", ~np.isfinite(np.einsum("bi->b", rate)), "three finite rates [rad/s]"),
+        ):
+            if bad.any():
+                body = int(bodies[np.argmax(bad)])
+                value = getattr(state, name)[body].tolist()
+                raise UsageError(f"state.{name}[{body}] is {value}; give {remedy}")
+
     def _body(self, body: int) -> int:
         return checked_index("body", body, len(self.model.body_mass), UsageError)
 
@@ -366,7 +523,7 @@ class Simulation:
 def base_pose(pose: Sequence[float] | np.ndarray, terrain: Terrain | None = None) -> np.ndarray:
     """Returns the pose [7] of a robot's base from (x, y, yaw) in m and rad, on the ground, or from a pose [7]. Raises
     :class:`UsageError` for other values."""
-    given = _numbers(pose)
+    given = as_numbers(pose)
     if given.shape not in ((3,), (7,)) or not np.isfinite(given).all():
         shown = given.tolist() if given.ndim else pose
         raise UsageError(f"pose is {shown}; give (x, y, yaw) in m and rad, or position and quaternion [7]")
@@ -389,17 +546,6 @@ def model_of(source: Model | Scene | CaneBuilder | TreeBuilder | Iterable[CaneBu
     return assemble(canes)
 
 
-def _vector(name: str, value: Sequence[float] | np.ndarray, unit: str) -> np.ndarray:
-    """Returns three finite numbers as an array. Raises :class:`UsageError` for other values."""
-    vector = _numbers(value)
-    if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise UsageError(f"{name} is {value}; give three finite numbers [{unit}]")
-    return vector
-
-
-def _numbers(value: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Returns ``value`` as an array of numbers; an array of one NaN if it is not numeric."""
-    try:
-        return np.asarray(value, float)
-    except (TypeError, ValueError):
-        return np.array(np.nan)
+def _warn_caller_of_step(text: str) -> None:
+    """Warn at the line that called :meth:`Simulation.step`."""
+    warnings.warn(text, RuntimeWarning, stacklevel=4)  # above: FaultLog.update, Simulation.step, the caller

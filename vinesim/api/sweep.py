@@ -20,6 +20,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any, TypeVar
 
 from vinesim.core.errors import UsageError
+from vinesim.core.numbers import is_whole
 
 log = logging.getLogger(__name__)
 
@@ -61,8 +62,8 @@ def sweep(
         finally:
             for future in futures:  # if a task has raised an exception, later tasks need not begin
                 future.cancel()
-    if workers is not None and workers < 1:
-        raise UsageError(f"workers is {workers}; give 1 or more")
+    if workers is not None and not (is_whole(workers) and workers >= 1):
+        raise UsageError(f"workers is {workers}; give a whole number of 1 or more")
     number = workers or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
     results: dict[int, R] = {}
     lost = [0] * len(tasks)

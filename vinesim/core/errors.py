@@ -56,7 +56,7 @@ def checked_index(what: str, index: SupportsIndex, count: int, error: type[Value
     """Returns ``index`` as an int. Raises ``error``, with a message that names ``what``, unless 0 <= ``index`` <
     ``count``."""
     try:
-        number = operator.index(index)
+        number = -1 if isinstance(index, bool) else operator.index(index)  # True would be 1
     except TypeError:
         number = -1
     if not 0 <= number < count:

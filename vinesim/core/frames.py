@@ -15,6 +15,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from vinesim.core.numbers import as_numbers
+
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 """The unit quaternion, xyzw."""
 
@@ -174,10 +176,11 @@ def pose(position: npt.ArrayLike, quaternion: npt.ArrayLike = IDENTITY) -> np.nd
 def checked_pose(what: str, given: npt.ArrayLike, error: type[ValueError] = ValueError) -> np.ndarray:
     """Returns the pose ``given`` [7] as an array of floats. Raises ``error``, with a message that names ``what``,
     unless all numbers are finite and the quaternion has length 1."""
-    values = np.asarray(given, float)
+    values = as_numbers(given)
     if values.shape != (7,) or not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1.0) > 1e-3:
         raise error(
-            f"{what} is {values.tolist()}; give position [m] and unit quaternion (x, y, z, w), 7 finite numbers"
+            f"{what} is {values.tolist() if values.ndim else given}; give position [m] and unit quaternion "
+            "(x, y, z, w), 7 finite numbers"
         )
     return values
 

@@ -40,7 +40,7 @@ class DeviceLost(RuntimeError):
 def find_device(name: str) -> wp.Device:
     """Returns the Warp device with the name ``cpu``, ``cuda`` or ``cuda:N``. Raises :class:`DeviceUnavailable` if it
     does not exist."""
-    if name != "cpu" and name.partition(":")[0] != "cuda":
+    if not isinstance(name, str) or (name != "cpu" and name.partition(":")[0] != "cuda"):
         raise DeviceUnavailable(f"device {name!r}: give cpu, cuda or cuda:N")
     if name != "cpu" and wp.get_cuda_device_count() == 0:
         raise DeviceUnavailable(

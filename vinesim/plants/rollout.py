@@ -195,7 +195,12 @@ class Rollout:
         start = {name: getattr(self.state, name) for name in self._states}
         start[_COUNTER] = np.zeros(len(model.tree_first), np.int32)
         if joint_q is not None:
-            start["joint_q"] = frames.normalize(self._sound("joint_q", joint_q, start["joint_q"].shape))
+            start["joint_q"] = self._sound("joint_q", joint_q, start["joint_q"].shape)
+            bad = np.flatnonzero(abs(np.linalg.norm(start["joint_q"], axis=-1) - 1.0) > 1e-3)
+            if len(bad):
+                given = start["joint_q"][bad[0]].tolist()
+                raise ValueError(f"joint_q[{bad[0]}] is {given}; give a unit quaternion xyzw")
+            start["joint_q"] = frames.normalize(start["joint_q"])
         if joint_qd is not None:
             start["joint_qd"] = self._sound("joint_qd", joint_qd, start["joint_qd"].shape)
         poses = np.empty((self.ticks + 1, len(self.watched), 7), np.float32)

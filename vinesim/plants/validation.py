@@ -7,6 +7,8 @@ import logging
 import numpy as np
 
 from vinesim.core.errors import checked_index
+from vinesim.scene.berries import VARIETIES
+from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
@@ -83,9 +85,32 @@ def validate(model: Model, state: State) -> None:
     )
     for what, q in (("rest rotation", model.body_rest), ("joint rotation", state.joint_q)):
         refuse(abs(np.linalg.norm(q, axis=-1) - 1.0) > 1e-3, what, q, "give a unit quaternion xyzw")
+    pose = model.tree_pose[model.body_tree, 3:]
+    refuse(
+        abs(np.linalg.norm(pose, axis=-1) - 1.0) > 1e-3, "root frame's rotation", pose, "give a unit quaternion xyzw"
+    )
+    organs = [int(organ) for organ in Organ]
+    refuse(~np.isin(model.body_organ, organs), "organ", model.body_organ, "give a member of vinesim.Organ")
     refuse(~(model.body_drag >= 0.0), "drag area [m^2]", model.body_drag, "air holds back: use 0 or more")
+    _validate_bunches(model)
     _validate_clusters(model)
     _validate_ties(model)
+
+
+def _validate_bunches(model: Model) -> None:
+    """Check that bunches are bodies of the model, and that their sizes and strengths are positive."""
+
+    def refuse(bad: np.ndarray, name: str, remedy: str) -> None:
+        if bad.any():
+            bunch = int(np.argmax(bad))
+            raise ValueError(f"bunch {bunch}: {name} is {getattr(model, name)[bunch].item()}; {remedy}")
+
+    body = model.bunch_body
+    refuse((body < 0) | (body >= len(model.body_mass)), "bunch_body", f"give 0 to {len(model.body_mass) - 1}")
+    for name in ("bunch_pull", "bunch_bend", "bunch_length", "bunch_radius", "bunch_berries"):
+        refuse(~(getattr(model, name) > 0), name, "give a number above 0")
+    count = len(VARIETIES)
+    refuse((model.bunch_variety < 0) | (model.bunch_variety >= count), "bunch_variety", f"give 0 to {count - 1}")
 
 
 def _validate_clusters(model: Model) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 
 from vinesim.core import frames, portable_math
 from vinesim.core.errors import checked_index
+from vinesim.core.numbers import as_numbers, is_number, is_whole
 from vinesim.scene import berries, plant_parameters, plausibility
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
@@ -211,10 +212,16 @@ class TreeBuilder:
             bends: [segments, 4] rotation (quaternion xyzw) of each segment relative to the previous one; straight
                 unless given.
         """
-        if not (min(length, *radius, material.modulus, material.density) > 0.0 and segments >= 1):
+        sizes = as_numbers([length, *radius, material.modulus, material.density])
+        losses = as_numbers([material.damping, material.shear_modulus or 0.0])
+        sound = np.isfinite(sizes).all() and (sizes > 0.0).all() and np.isfinite(losses).all() and (losses >= 0.0).all()
+        if not (sound and is_whole(segments) and segments >= 1):
             raise ValueError(
-                f"rod of length {length} m, radius {radius} m, {segments} segments, {material}: all must be positive"
+                f"rod of length {length} m, radius {radius} m, {segments} segments, {material}: all must be positive "
+                "and finite (damping may be 0), segments a whole number"
             )
+        if bends is not None and np.shape(bends) != (segments, 4):
+            raise ValueError(f"rod: bends has the shape {np.shape(bends)}; give [{segments}, 4]")
         place = f"rod of {organ.name.lower()} on body {parent}"
         plausibility.check_rod(place, radius)
         plausibility.check(place, "density", material.density)
@@ -298,15 +305,23 @@ class TreeBuilder:
             clusters: whether the bunch can be divided into berry clusters (rigid groups of berries) while actors are
                 near.
             parameters: parameters of the rachis; ``data/plants/vine.toml`` unless given.
-            **fields: further ``bunch_`` fields of the :class:`Model`, named without this prefix.
+            **fields: strength of the peduncle, ``pull`` [N] and ``bend`` [N m]; see ``bunch_pull`` and ``bunch_bend``
+                of :class:`Model`.
 
         Raises :class:`ValueError` if the parent is not in the list, or for a number out of range.
         """
         parent = checked_index("body", parent, len(self.bodies))
         variety = checked_index("variety", variety, len(berries.VARIETIES))
         most = berries.most_berries(variety)
-        if not 0.0 < mass < np.inf or not 1 <= count <= most:
+        if not (is_number(mass) and mass > 0.0 and is_whole(count) and 1 <= count <= most):
             raise ValueError(f"bunch of {mass} kg, {count} berries; give a finite mass above 0 and 1 to {most} berries")
+        if not (is_whole(seed) and 0 <= seed < 2**32):
+            raise ValueError(f"bunch on body {parent}: seed is {seed}; give a whole number from 0 to 4294967295")
+        for name, value in fields.items():
+            if name not in ("pull", "bend"):
+                raise ValueError(f"bunch on body {parent} has no field {name!r}; it has: pull, bend")
+            if not (is_number(value) and value > 0.0):
+                raise ValueError(f"bunch on body {parent}: {name} is {value}; give a finite number above 0")
         plausibility.check(f"bunch on body {parent}", "mass", mass)
         parameters = plant_parameters.load_plant("vine") if parameters is None else parameters
         above = self.bodies[parent]
@@ -395,7 +410,7 @@ def _check_fields(body: int, fields: dict[str, Any]) -> None:
     for name, given in fields.items():
         if name not in _FIELDS:
             raise ValueError(f"body {body} has no field {name!r}; it has: {', '.join(sorted(_FIELDS))}")
-        value = np.asarray(given, float)
+        value = as_numbers(given)
         if not np.isfinite(value).all():
             raise ValueError(f"body {body}: {name} is {given}; give finite numbers")
         if name in _POSITIVE and not (value > 0.0).all():

@@ -2,7 +2,7 @@
 
     builder = CaneBuilder(length=1.0, radius=(0.006, 0.003), tip_mass=0.2, damping_ratio=0.05)
     model = builder.build()  # one cane
-    model = assemble([builder, CaneBuilder()])  # several
+    model = assemble([builder, CaneBuilder()])  # several; wires, ties and boxes: vinesim.scene.surroundings
 
 To add branches and bunches, use :meth:`CaneBuilder.tree`.
 """
@@ -11,15 +11,17 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Literal
 
 import numpy as np
 
 from vinesim.core import frames
+from vinesim.core.numbers import is_number, is_whole
 from vinesim.scene import builder, plausibility
 from vinesim.scene.builder import RodMaterial, TreeBuilder
 from vinesim.scene.model import Model
+from vinesim.scene.surroundings import Box, Tie, Wire, surroundings
 
 MODE_SEGMENTS = 64
 """Largest number of segments for which the frequency of a cane is checked; the check takes 0.3 ms for 64."""
@@ -38,7 +40,9 @@ class CaneBuilder:
     radius: float | tuple[float, float] = 0.004
     """[m] Radius of the rod, or its radii at the base and at the tip."""
     youngs_modulus: float = 5e9
-    """[Pa] Young's modulus E of bending; the shear modulus is E / 2.6 (Poisson's ratio 0.3)."""
+    """[Pa] Young's modulus E of bending."""
+    shear_modulus: float | None = None
+    """[Pa] Shear modulus G of torsion; E / 2.6 (Poisson's ratio 0.3) unless given."""
     density: float = 800.0
     """[kg/m^3] Density of the wood."""
     segments: int = 16
@@ -71,7 +75,7 @@ class CaneBuilder:
     @functools.cached_property
     def _undamped(self) -> TreeBuilder:
         tree = TreeBuilder(np.asarray(self.pose, float))
-        material = RodMaterial(self.youngs_modulus, self.density)
+        material = RodMaterial(self.youngs_modulus, self.density, shear_modulus=self.shear_modulus)
         turns = None if self.bends is None else frames.exp(np.asarray(self.bends, float))
         with plausibility.unchecked():  # tree() checks the numbers under the user's names
             tree.add_rod(-1, self.length, self._radii, material, self.segments, bends=turns)
@@ -136,14 +140,16 @@ class CaneBuilder:
             raise ValueError(f"cane: radius is {self.radius}; give one number, or two for base and tip")
         numbers = {"length": self.length, "youngs_modulus": self.youngs_modulus, "density": self.density}
         radii = np.broadcast_to(np.asarray(self.radius, object), 2)
+        if self.shear_modulus is not None:
+            numbers["shear_modulus"] = self.shear_modulus
         numbers |= {f"radius[{i}]": value for i, value in enumerate(radii.tolist())}
         for name, value in numbers.items():
-            if not (_is_finite(value) and value > 0.0):
+            if not (is_number(value) and value > 0.0):
                 raise ValueError(f"cane: {name} is {value}; give a finite number above 0")
         for name, value in {"tip_mass": self.tip_mass, "damping_ratio": self.damping_ratio, "beta": self.beta}.items():
-            if value is not None and not (_is_finite(value) and value >= 0.0):
+            if value is not None and not (is_number(value) and value >= 0.0):
                 raise ValueError(f"cane: {name} is {value}; give a finite number of 0 or more")
-        if not isinstance(self.segments, int | np.integer) or self.segments < 1:
+        if not is_whole(self.segments) or self.segments < 1:
             raise ValueError(f"cane: segments is {self.segments}; give a whole number, 1 or more")
         if self.damping_ratio is not None and self.beta is not None:
             raise ValueError(
@@ -170,10 +176,6 @@ class CaneBuilder:
             plausibility.check("cane", "frequency", self.first_mode() / (2.0 * np.pi), "frequency of its first mode")
 
 
-def _is_finite(value: object) -> bool:
-    return isinstance(value, int | float | np.integer | np.floating) and bool(np.isfinite(value))
-
-
 def _add_point_mass(body: dict, mass: float) -> None:
     """Add a point mass [kg] at the tip of a segment to the segment's mass, centre of mass and moments of inertia."""
     own = body["mass"]
@@ -190,6 +192,16 @@ def cane(**fields: object) -> Model:
     return CaneBuilder(**fields).build()  # pyright: ignore[reportArgumentType] # checked by the builder
 
 
-def assemble(canes: Iterable[CaneBuilder | TreeBuilder]) -> Model:
-    """Returns one model of several canes. Each cane is a tree; trees are numbered in the given order."""
-    return builder.assemble([one.tree() if isinstance(one, CaneBuilder) else one for one in canes])
+def assemble(
+    canes: Iterable[CaneBuilder | TreeBuilder],
+    *,
+    wires: Sequence[Wire] = (),
+    ties: Sequence[Tie] = (),
+    boxes: Sequence[Box] = (),
+) -> Model:
+    """Returns one model of canes, and of what surrounds them. Each cane is a tree; trees, wires and boxes are numbered
+    in the given order. Raises :class:`ValueError` if a tie names a cane, place or wire that does not exist."""
+    trees = [one.tree() if isinstance(one, CaneBuilder) else one for one in canes]
+    if not (wires or ties or boxes):
+        return builder.assemble(trees)
+    return builder.assemble(trees, **surroundings(builder.assemble(trees), wires, ties, boxes))

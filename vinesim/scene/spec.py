@@ -18,6 +18,7 @@ from PIL import Image, UnidentifiedImageError
 
 from vinesim.core.data_files import DataFileNotFound, find_data_file
 from vinesim.core.geodesy import APRILIA, Geodetic
+from vinesim.core.numbers import is_whole
 from vinesim.core.toml_loader import DataError, load_toml
 from vinesim.scene import plant_parameters
 from vinesim.scene.berries import VARIETIES
@@ -457,6 +458,6 @@ def with_seed(scene: Scene, seed: int | None) -> Scene:
     """Returns a copy of the scene with the given seed; None keeps the scene's own seed."""
     if seed is None:
         return scene
-    if seed < 0:
-        raise SceneError(f"seed is {seed}: give 0 or more")
+    if not is_whole(seed) or seed < 0:
+        raise SceneError(f"seed is {seed}: give a whole number of 0 or more")
     return msgspec.structs.replace(scene, seed=seed)

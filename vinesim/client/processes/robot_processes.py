@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from typing import Any, Self
 
 from vinesim.client.client import Client
+from vinesim.client.faults import RecentCounts
 from vinesim.client.processes.ros_process import RosProcess
 from vinesim.client.processes.sensor_process import SensorProcess
-from vinesim.client.status import RecentCounts
 from vinesim.net.pace import describe
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.controlled_robot import Robot

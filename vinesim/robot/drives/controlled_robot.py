@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from vinesim.core import frames
+from vinesim.core.numbers import is_number
 from vinesim.interaction.detachment import Blade
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
@@ -207,8 +208,8 @@ class Robot(RobotInstance):
     def command_base(self, linear: float, angular: float, time: float) -> None:
         """Drive with ``linear`` [m/s] ahead and ``angular`` [rad/s] to the left. The base stops
         :attr:`BaseLimits.timeout` after the last command."""
-        if not np.isfinite([linear, angular]).all():
-            raise CommandError(f"{self.name}: base velocity ({linear}, {angular}) is not finite")
+        if not (is_number(linear) and is_number(angular)):
+            raise CommandError(f"{self.name}: base velocity is ({linear}, {angular}); give finite numbers [m/s, rad/s]")
         limits = self.description.base_limits
         if limits.kind == "free":
             raise CommandError(f"{self.name} stands on its legs: it has no wheels to drive; command its joints")
@@ -230,7 +231,8 @@ class Robot(RobotInstance):
         """Returns indices [k] and values [k] of a command. Raises :class:`CommandError` if their numbers differ or a
         value is not finite."""
         i = self.joint_indices(joints)
-        values = np.asarray(values, float)
+        given = np.asarray(values)
+        values = given.astype(float) if given.dtype.kind in "iuf" else np.full(given.shape, np.nan)
         if values.shape != i.shape:
             raise CommandError(f"{self.name}: {values.size} values for {len(i)} joints; give one each")
         if not np.isfinite(values).all():
