@@ -23,7 +23,7 @@ from vinesim.api.pusher import Pusher, checked_shape
 from vinesim.client.faults import FaultLog, occurred
 from vinesim.core import frames, progress
 from vinesim.core.errors import UsageError, checked_index
-from vinesim.core.numbers import as_numbers, checked_vector, is_whole
+from vinesim.core.numbers import as_numbers, checked_vector, is_number, is_whole
 from vinesim.interaction.detachment import Blade
 from vinesim.kernels.compilation import PHYSICS_PACKAGES, compile_kernels
 from vinesim.robot.description.loader import load_description
@@ -31,6 +31,7 @@ from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.builder import TreeBuilder
 from vinesim.scene.cane import CaneBuilder, assemble
 from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.spec import Scene, load_scene
@@ -318,7 +319,7 @@ class Simulation:
             length = float(self.model.body_length[body])
             if self.model.body_organ[body] != int(Organ.PEDUNCLE):
                 raise UsageError(f"at {at!r}: body {body} is no peduncle, and parts at its joint; leave out at")
-            if not 0.0 <= at <= length:
+            if not (is_number(at) and 0.0 <= at <= length):
                 raise UsageError(f"at {at!r}: body {body} is {length:.4g} m long; give 0 to {length:.4g}")
         self.physics.cut(body, at)
 
