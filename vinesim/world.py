@@ -16,6 +16,7 @@ from vinesim.core import frames
 from vinesim.interaction.detachment import Blade, DetachmentMonitor
 from vinesim.interaction.dormant_bunches import DormantBunches
 from vinesim.interaction.hand_grasp import GraspManager
+from vinesim.interaction.stalk import is_on_stalk
 from vinesim.interaction.support_tracking import SupportTracker
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.plants.fault_guard import FaultGuard
@@ -317,15 +318,28 @@ class Physics:
         self.detachment_monitor.pick(bunch)
         self._body_q = None
 
-    def cut(self, body: int) -> None:
-        """Cut a piece of wood off its vine, between steps; see :meth:`DetachmentMonitor.cut`."""
-        self.detachment_monitor.cut(body)
+    def cut(self, body: int, at: float | None = None) -> None:
+        """Cut a piece of wood off its vine, between steps; see :meth:`DetachmentMonitor.cut`. ``at``: place [m] of the
+        cut along a segment of a peduncle."""
+        self.detachment_monitor.cut(body, at=at)
         self._body_q = None
 
     def apply_remote_pick(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
         """Pick a bunch that another client has picked; see :meth:`DetachmentMonitor.apply_remote_pick`."""
         self.detachment_monitor.apply_remote_pick(bunch, pose, velocity)
         self._body_q = None
+
+    def apply_remote_stalk(self, bunch: int, segment: int, at: float) -> None:
+        """Cut a bunch, now or when it leaves its vine, where another client has cut it: ``at`` [m] along ``segment``.
+
+        Nothing happens if that place is not on its peduncle, or if the bunch has a stalk already.
+        """
+        if is_on_stalk(self.model, bunch, segment, at) and self.state.cut_segment[bunch] < 0:
+            self.state.cut_segment[bunch] = segment
+            self.state.cut_at[bunch] = at
+            self.detachment_monitor.restore_stalk(bunch)
+            self.dormant_bunches.restore_stalk(bunch)
+            self._body_q = None
 
     def apply_remote_cut(self, body: int) -> None:
         """Cut off a piece of wood that another client has cut off; see :meth:`DetachmentMonitor.apply_remote_cut`."""

@@ -67,7 +67,7 @@ def read_dataset(folder: pathlib.Path, limit: int | None = None, skip: int = 0) 
 
     Raises :class:`UsageError` for a folder that holds none, or with a file that cannot be read.
     """
-    files = sorted((folder / "images").glob("*")) if folder.is_dir() else []
+    files = sorted((folder / "images").glob("*.png")) if folder.is_dir() else []
     if not files:
         raise UsageError(f"--synthetic {folder} holds no pictures; give a folder that `vinesim dataset` has written")
     if skip >= len(files):

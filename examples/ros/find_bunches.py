@@ -19,6 +19,10 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CameraInfo, Image
 
 
+VIVIDNESS = 2.5
+"""Factor on the distance of a colour from grey: a D435 has pale colours."""
+
+
 class BunchFinder(Node):
     def __init__(self, camera: str = "/head_front_camera") -> None:
         super().__init__("find_bunches")
@@ -43,10 +47,13 @@ def find(picture: np.ndarray, metres: np.ndarray, k: np.ndarray) -> list[np.ndar
 
     ``k`` [3, 3]: camera matrix.
     """
-    red, green, blue = np.moveaxis(picture.astype(int), 2, 0)
+    smooth = cv2.blur(picture, (5, 5)).astype(float)  # the noise of a pixel, and shade between berries
+    grey = smooth.mean(axis=2, keepdims=True)
+    red, green, blue = np.moveaxis(grey + VIVIDNESS * (smooth - grey), 2, 0)
     amber = (abs(red - green) < 0.1 * green) & (blue < 0.65 * green)
     fruit = (amber | ((red > 1.3 * green) & (blue > green - 8))) & (metres > 0.0) & (metres < 3.0)
     fruit = cv2.morphologyEx(fruit.astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+    fruit = cv2.morphologyEx(fruit, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8))
     count, pieces = cv2.connectedComponents(fruit)
     places = []
     for piece in range(1, count):
@@ -55,7 +62,8 @@ def find(picture: np.ndarray, metres: np.ndarray, k: np.ndarray) -> list[np.ndar
             z = np.median(metres[rows, columns])
             (near, far) = np.percentile(metres[rows, columns], (10, 90))
             size = np.ptp([columns, rows], axis=1) * z / k[0, 0]
-            if size.max() < 0.3 and far - near < 0.1:  # grass and soil extend over a larger range of depths
+            # yellow leaves are narrower; grass and soil extend over a larger range of depths
+            if size.min() > 0.07 and size.max() < 0.3 and far - near < 0.1:
                 places.append(np.linalg.inv(k) @ [np.median(columns) * z, np.median(rows) * z, z])
     return places
 

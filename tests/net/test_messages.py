@@ -455,7 +455,11 @@ def record(**change) -> RetainedRecord:
 
 
 def test_records_are_decoded_as_encoded():
-    sent = [record(), record(object=ids.object_id(ids.ObjectKind.TREE, 5), parent="", cut=(7, 9), trees=b"abc")]
+    sent = [
+        record(),
+        record(stalk=(12, 345)),
+        record(object=ids.object_id(ids.ObjectKind.TREE, 5), parent="", cut=(7, 9), trees=b"abc"),
+    ]
     received = decode_records(encode_records(sent))
     assert received == sent
     assert received[0].claim == Claim(3, 65535, "picker")
@@ -476,6 +480,9 @@ def test_records_are_decoded_as_encoded():
         ({"place": (0, np.inf, 0, 0, 0, 0, 1.0)}, "not finite"),
         ({"place": (0, 0, 0, 0, 0, 0, 0.0)}, "no unit quaternion"),
         ({"cut": (-1,)}, "impossible"),
+        ({"stalk": (-1, 10)}, "impossible stalk"),
+        ({"stalk": (5, 0)}, "impossible stalk"),
+        ({"stalk": (5, 65536)}, "impossible stalk"),
         ({"parent": "x" * 201}, "impossible"),
     ],
 )

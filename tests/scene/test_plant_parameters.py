@@ -21,8 +21,11 @@ def numbers(part):
 
 
 def all_numbers():
-    """Every number of the plant file and of the varieties."""
-    yield from numbers(plant_parameters.load_plant("vine"))
+    """Every number of the plant files and of the varieties, once: those that a file takes from another count there."""
+    vine = plant_parameters.load_plant("vine")
+    yield from numbers(vine)
+    usual = set(numbers(vine))
+    yield from (number for number in numbers(plant_parameters.load_plant("wine_vine")) if number not in usual)
     for variety in plant_parameters.load_varieties():
         yield from numbers(variety)
 

@@ -71,6 +71,7 @@ def _hang_bunch(tree: TreeBuilder, parent: int, mass: float, stiffness: float, c
             np.array([0.045]),
             np.array([80]),
             np.array([0]),
+            np.array([0]),
             vine.rachis,
             vine.bunch.stem_share.value,
         )

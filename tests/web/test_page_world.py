@@ -180,6 +180,21 @@ def test_a_picked_bunch_becomes_a_rigid_body_of_the_page(shown):
     assert (carriers == bodies + 1 + row).sum() >= client.model.bunch_berries[4]
 
 
+def test_the_page_gets_the_stump_of_a_cut_peduncle(shown):
+    client, world = shown
+    world.scene()
+    client.tick()
+    world.state(-1)
+    model = client.model
+    segment = int(model.body_parent[model.bunch_body[3]])
+    client.physics.cut(segment, 0.01)
+    client.tick()
+    world.state(-1)
+    _, shapes = decode(world.rigid())
+    assert shapes["stump_carrier"].tolist() == [segment]
+    assert shapes["stump_shape"].reshape(-1, 16)[0, 4] == pytest.approx(0.01, abs=1e-6)
+
+
 def test_the_eyes_of_a_spectator_follow_the_page(shown):
     client, world = shown
     here = (4.0, 5.0, 2.0, 0.0, 0.0, 1.0, 0.0)

@@ -279,11 +279,21 @@ class Simulation:
         self.physics.rigid.apply_wrench(robot, link, force, torque)
         self._pushed.add((robot, link))
 
-    def cut(self, body: int) -> None:
-        """Cut a cane at the joint between a body and its parent; the body and everything that grows on it fall.
-        ``body``: index in the model."""
+    def cut(self, body: int, at: float | None = None) -> None:
+        """Cut a cane or a peduncle. What is beyond the cut falls.
+
+        A peduncle is cut ``at`` [m] from the origin of its segment ``body`` (None: in the middle), and the bunch keeps
+        the stalk beyond the cut. A cane parts at the joint between ``body`` and its parent. ``body``: index in the
+        model. Raises :class:`UsageError` if a place is given for a cane, or a place that is not on the segment.
+        """
         body = self._body(body)
-        self.physics.cut(body)
+        if at is not None:
+            length = float(self.model.body_length[body])
+            if self.model.body_organ[body] != int(Organ.PEDUNCLE):
+                raise UsageError(f"at {at!r}: body {body} is no peduncle, and parts at its joint; leave out at")
+            if not 0.0 <= at <= length:
+                raise UsageError(f"at {at!r}: body {body} is {length:.4g} m long; give 0 to {length:.4g}")
+        self.physics.cut(body, at)
 
     def pick(self, bunch: int) -> None:
         """Detach a bunch from its vine, so that it falls. ``bunch``: index in the model."""

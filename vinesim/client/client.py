@@ -456,6 +456,7 @@ class Client:
                 has_body=self.physics.support_tracker.__contains__,
                 messages={kind: exchange.say(name) for kind, exchange in self.exchanges.items()},
                 carried_on=carried_on,
+                stalk_of=objects.stalk_of,
             )
             for update in settled:
                 # All copies hold the quantised state of the last message, so this client takes it, too.
@@ -482,6 +483,7 @@ class Client:
                     grabbed=supported,
                     detached=supported,
                     pose_on_support=self.physics.support_tracker.pose_on_support,
+                    stalk_of=self.objects.stalk_of,
                 )
 
     def side_of(self, point: np.ndarray) -> str:

@@ -20,6 +20,7 @@ from vinesim.contact.plant_capsules import nearest_body, plant_capsules
 from vinesim.kernels.contact import structs
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.rigid.rigid_world import RigidWorld
+from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.values import Contact
 from vinesim.wires.deflected_wires import DeflectedWires
@@ -262,6 +263,17 @@ class ContactSolver:
     def update_tree_bounds(self, trees: np.ndarray) -> None:
         """Compute the bounding boxes of the sleeping trees ``trees`` [k] again, after their bodies were moved."""
         self.detection.update_tree_bounds(trees)
+
+    def leave_stump(self, segment: int, length: float) -> None:
+        """Shorten the wood of a peduncle's segment to ``length`` [m]. It and the segments between it and the vine
+        collide on, although their bunch has left."""
+        shapes = self.capsules
+        model = self.plants.model
+        body = segment
+        while body >= 0 and model.body_organ[body] == int(Organ.PEDUNCLE):
+            shapes.bunch[shapes.body == body] = -1
+            body = int(model.body_parent[body])
+        self.detection.shorten(int(np.flatnonzero(shapes.body == segment)[0]), length)
 
     def ignore_overlaps(self, bunch: int, low: np.ndarray, high: np.ndarray) -> None:
         """Disable contacts of a picked bunch with the trees that it overlaps; see

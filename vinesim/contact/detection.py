@@ -175,6 +175,17 @@ class ContactDetection:
 
     # ------------------------------------------------------------------ narrowphase
 
+    def shorten(self, capsule: int, length: float) -> None:
+        """Move the end of a capsule along its axis, so that it lies ``length`` [m] from its body's origin."""
+        shapes = self.arrays.capsules
+        share = length / float(shapes.local_end[capsule, 0])
+        shapes.rest_end[capsule] = shapes.rest_start[capsule] + share * (
+            shapes.rest_end[capsule] - shapes.rest_start[capsule]
+        )
+        shapes.local_end[capsule] *= share
+        shapes.extent[capsule] = length + shapes.radius[capsule]
+        self.forget_clearances()
+
     def ignore_overlaps(self, bunch: int, low: np.ndarray, high: np.ndarray) -> None:
         """Disable the contacts of a picked bunch with the trees that it overlaps, until it no longer overlaps them.
 

@@ -31,6 +31,12 @@ class DataError(ValueError):
 def load_toml(path: pathlib.Path, kind: type[T], error: type[DataError] = DataError) -> T:
     """Returns the content of the TOML file at ``path`` as an object of the class ``kind``. Raises ``error`` if the file
     cannot be read or does not fit ``kind``."""
+    return to_struct(read_toml(path, error), kind, str(path), error)
+
+
+def read_toml(path: pathlib.Path, error: type[DataError] = DataError) -> dict[str, Any]:
+    """Returns the tables of the TOML file at ``path``. Raises ``error`` if the file cannot be read or has a number that
+    is not finite."""
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except tomllib.TOMLDecodeError as bad:
@@ -40,7 +46,7 @@ def load_toml(path: pathlib.Path, kind: type[T], error: type[DataError] = DataEr
     for place, value in _leaves(data):
         if isinstance(value, float) and not math.isfinite(value):
             raise error(f"{path}: {place} is {value}; give a finite number")
-    return to_struct(data, kind, str(path), error)
+    return data
 
 
 def to_struct(data: dict[str, Any], kind: type[T], source: str, error: type[DataError] = DataError) -> T:

@@ -17,6 +17,7 @@ from vinesim.contact.contact_solver import ContactSolver
 from vinesim.core import frames
 from vinesim.core.errors import checked_index
 from vinesim.core.warp_arrays import share
+from vinesim.interaction.stalk import cut_place, leave_stump, model_pieces, stalk_below, with_settled_stalk, with_stalk
 from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.plants.tree_checks import count_overloaded_steps
 from vinesim.plants.articulation_solver import ArticulationSolver, spans
@@ -185,7 +186,7 @@ class DetachmentMonitor:
                     if bunch < 0:
                         self.cut(body, "blade", blade.actor)
                     elif self.plants.state.bunch_attached[bunch]:
-                        self.pick(bunch, "blade", blade.actor)
+                        self.pick(bunch, "blade", blade.actor, *self._cut_in_peduncle(blade, bunch))
                 blade.detachments = tuple(self._detachments[before:])
 
     def wood_in_mouth(self, blade: Blade) -> list[tuple[int, int]]:
@@ -210,20 +211,41 @@ class DetachmentMonitor:
         apart = body_q[:, :3] - mouth[:3].astype(np.float32)
         reach = far + model.body_length
         near = np.flatnonzero(self._wood & ((apart * apart).sum(1) < reach * reach))
-        start = frames.rotate(frames.conjugate(mouth[3:]), body_q[near, :3] - mouth[:3])
-        along = frames.rotate(frames.multiply(frames.conjugate(mouth[3:]), body_q[near, 3:]), np.array([1.0, 0.0, 0.0]))
-        along = along * model.body_length[near, None]
-        # slab test: the part of each axis inside the box
-        along = np.where(np.abs(along) < 1e-12, 1e-12, along)
-        one = (-blade.half - start) / along
-        other = (blade.half - start) / along
-        enter = np.minimum(one, other).max(1)
-        leave = np.maximum(one, other).min(1)
-        caught = near[(enter <= leave) & (leave >= 0.0) & (enter <= 1.0)]
+        _, _, enter, leave = self._axes_in_mouth(blade, near)
+        caught = near[enter <= leave]
         caught = caught[~self.plants.state.body_cut[caught]]
         inside = np.zeros(len(self._wood), bool)
         inside[caught] = True
         return caught[~self._has_marked_ancestor(caught, inside)]
+
+    def _cut_in_peduncle(self, blade: Blade, bunch: int) -> tuple[int, float]:
+        """Returns the segment of a bunch's peduncle in which a closing blade cuts it, and the place [m] along it: the
+        point of the peduncle nearest to the plane in which the blades close, within the mouth."""
+        model = self.plants.model
+        segments = np.flatnonzero((self._bunch_of == bunch) & (model.body_organ == int(Organ.PEDUNCLE)))
+        start, along, enter, leave = self._axes_in_mouth(blade, segments)
+        inside = enter <= leave
+        crossing = np.clip(-start[:, 2] / along[:, 2], enter, np.maximum(leave, enter))
+        apart = np.where(inside, np.abs(start[:, 2] + crossing * along[:, 2]), np.inf)
+        best = int(np.argmin(apart))
+        return int(segments[best]), float(crossing[best] * model.body_length[segments[best]])
+
+    def _axes_in_mouth(self, blade: Blade, bodies: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Returns the axes of ``bodies`` [k] in the frame of a blade's mouth: starts [k, 3] m and vectors to the tips
+        [k, 3] m, and the shares [k] of these vectors between which the axes are in the mouth; no share is in it if the
+        first is larger than the second."""
+        body_q = self.plants.state.body_q
+        mouth = frames.compose(self.rigid.link_pose(blade.actor, blade.link), blade.pose)
+        start = frames.rotate(frames.conjugate(mouth[3:]), body_q[bodies, :3] - mouth[:3])
+        along = frames.rotate(frames.multiply(frames.conjugate(mouth[3:]), body_q[bodies, 3:]), np.array([1.0, 0, 0]))
+        along = along * self.plants.model.body_length[bodies, None]
+        # slab test: the part of each axis inside the box
+        along = np.where(np.abs(along) < 1e-12, 1e-12, along)
+        one = (-blade.half - start) / along
+        other = (blade.half - start) / along
+        enter = np.maximum(np.minimum(one, other).max(1), 0.0)
+        leave = np.minimum(np.maximum(one, other).min(1), 1.0)
+        return start, along, enter, leave
 
     def _has_marked_ancestor(self, bodies: np.ndarray, marked: np.ndarray) -> np.ndarray:
         """Returns for each of the ``bodies`` [k] whether it descends from a body in ``marked`` [body] bool, without a
@@ -239,18 +261,28 @@ class DetachmentMonitor:
 
     # ------------------------------------------------------------------ one at a time
 
-    def pick(self, bunch: int, cause: str = "command", actor: str = "") -> None:
+    def pick(
+        self, bunch: int, cause: str = "command", actor: str = "", segment: int | None = None, at: float = 0.0
+    ) -> None:
         """Detach one bunch from its vine. The bunch keeps its pose and velocity. Call this between steps.
 
-        Raises :class:`ValueError` if the bunch cannot be detached.
+        ``segment``: body of the segment of its peduncle that is cut ``at`` [m] from its origin; the bunch keeps the
+        stalk beyond the cut. None: the bunch parts at its own joint and keeps no stalk. Raises :class:`ValueError` if
+        the bunch cannot be detached there.
         """
         bunch = checked_index("bunch", bunch, len(self._overloaded_steps))
         if not self.plants.state.bunch_attached[bunch]:
             raise ValueError(f"bunch {bunch} was picked already")
         body = self.plants.model.bunch_body[bunch]
-        self._pick(bunch, cause, actor, self.plants.joint_wrench(np.array([body]))[0])
+        place = None
+        if segment is not None:
+            stalk_below(self.plants.model, bunch, segment)
+            place = segment, cut_place(self.plants.model, segment, at)
+        self._pick(bunch, cause, actor, self.plants.joint_wrench(np.array([body]))[0], place)
 
-    def _pick(self, bunch: int, cause: str, actor: str, carried: np.ndarray) -> None:
+    def _pick(
+        self, bunch: int, cause: str, actor: str, carried: np.ndarray, place: tuple[int, float] | None = None
+    ) -> None:
         plants = self.plants
         model = self.plants.model
         body = int(model.bunch_body[bunch])
@@ -278,6 +310,8 @@ class DetachmentMonitor:
             end=end,
             radius=shapes.radius[of].astype(float),
         )
+        if place is not None:
+            loose, velocity = self._take_stalk(bunch, loose, velocity, *place)
         self.rigid.add_bunch(bunch, loose, plants.state.body_q[body], velocity)
         self.rigid.ignore_overlaps(bunch)
         self.contact_solver.ignore_overlaps(bunch, *_box_around(loose, plants.state.body_q[body].astype(float)))
@@ -287,19 +321,45 @@ class DetachmentMonitor:
         if state.tree_fine[tree]:
             plants.berry_clusters.release(bunch)
         plants.body_drag[body] = 0.0
-        self._record(body, bunch, cause, actor, carried)
+        self._record(body, bunch, cause, actor, carried, place)
 
-    def cut(self, body: int, cause: str = "command", actor: str = "") -> None:
-        """Cut a piece of cane off its parent. All its descendants fall with it. Call this between steps.
+    def _take_stalk(
+        self, bunch: int, loose: FreeBunch, velocity: np.ndarray, segment: int, at: float
+    ) -> tuple[FreeBunch, np.ndarray]:
+        """Split a peduncle at ``at`` [m] along ``segment``. Returns the bunch with the stalk beyond the cut, and its
+        velocity [6] in world axes. The stump stays on the vine, where it can be touched.
+        """
+        plants = self.plants
+        state = plants.state
+        segments = stalk_below(plants.model, bunch, segment)
+        pieces = model_pieces(plants.model, segments, at)
+        frame, *above = _unit_poses(state.body_q[[plants.model.bunch_body[bunch], *segments]])
+        back = frames.conjugate(frame[3:])
+        rates = np.concatenate([velocity[None], state.body_qd[segments].astype(float)])
+        rates = frames.rotate(back, rates.reshape(-1, 3)).reshape(-1, 6)
+        poses = frames.compose(frames.inverse(frame), np.array(above))
+        radii = plants.model.body_radius[segments].mean(1).astype(float)
+        whole, own = with_stalk(loose, rates[0], segment, pieces, poses, rates[1:], radii)
+        leave_stump(plants, self.contact_solver, segments, at)
+        state.cut_segment[bunch] = segment
+        state.cut_at[bunch] = at
+        velocity = frames.rotate(frame[3:], own.reshape(2, 3)).ravel()
+        return whole, velocity
 
-        Raises :class:`ValueError` if the piece cannot be cut.
+    def cut(self, body: int, cause: str = "command", actor: str = "", at: float | None = None) -> None:
+        """Cut a piece of wood. What is beyond the cut falls. Call this between steps.
+
+        A peduncle is cut ``at`` [m] from the origin of the segment ``body``, by default in its middle, and its bunch
+        keeps the stalk beyond the cut. A cane parts at the joint between ``body`` and its parent, and ``at`` does not
+        count. Raises :class:`ValueError` if the piece cannot be cut.
         """
         plants = self.plants
         body = checked_index("body", body, len(self._wood))
         if plants.model.body_organ[body] == int(Organ.BUNCH):
             raise ValueError(f"body {body} is no piece of wood that can be cut")
         if self._bunch_of[body] >= 0:
-            self.pick(int(self._bunch_of[body]), cause, actor)
+            at = 0.5 * float(plants.model.body_length[body]) if at is None else at
+            self.pick(int(self._bunch_of[body]), cause, actor, body, at)
             return
         if plants.state.body_cut[body]:
             raise ValueError(f"body {body} was cut already")
@@ -313,11 +373,25 @@ class DetachmentMonitor:
     def apply_remote_pick(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
         """Detach a bunch that another client has detached, and set its ``pose`` [7] and ``velocity`` [6].
 
-        The bunch is not listed in this client's detachments.
+        The bunch is not listed in this client's detachments. It has the stalk that its record names, if that has
+        arrived (``State.cut_segment``).
         """
-        self._pick(bunch, "remote", "", np.zeros(6))
+        segment = int(self.plants.state.cut_segment[bunch])
+        place = None if segment < 0 else (segment, float(self.plants.state.cut_at[bunch]))
+        self._pick(bunch, "remote", "", np.zeros(6), place)
         self._detachments.pop()
         self.rigid.place_bunch(bunch, pose, velocity)
+
+    def restore_stalk(self, bunch: int) -> None:
+        """Give a free bunch the stalk that ``State.cut_segment`` names, if the bunch has a body. Its record has come
+        after its motion."""
+        if bunch in self.rigid.free_bunches:
+            state = self.plants.state
+            segment = int(state.cut_segment[bunch])
+            at = float(state.cut_at[bunch])
+            model = self.plants.model
+            leave_stump(self.plants, self.contact_solver, stalk_below(model, bunch, segment), at)
+            self.rigid.replace_bunch(bunch, with_settled_stalk(model, bunch, self.rigid.free_bunch(bunch), segment, at))
 
     def apply_remote_cut(self, body: int) -> None:
         """Cut off a body that another client has cut off."""
@@ -326,11 +400,22 @@ class DetachmentMonitor:
             self.plants.wake(tree)
             self.plants.cut(body)
 
-    def _record(self, body: int, bunch: int, cause: str, actor: str, carried: np.ndarray) -> None:
+    def _record(
+        self,
+        body: int,
+        bunch: int,
+        cause: str,
+        actor: str,
+        carried: np.ndarray,
+        place: tuple[int, float] | None = None,
+    ) -> None:
         tree = int(self.plants.model.body_tree[body])
         force = carried[:3].astype(float)
         moment = carried[3:].astype(float)
-        self._detachments.append(Detachment(self.plants.tick, tree, body, bunch, cause, actor, force, moment))
+        segment, at = (-1, 0.0) if place is None else place
+        self._detachments.append(
+            Detachment(self.plants.tick, tree, body, bunch, cause, actor, force, moment, segment, at)
+        )
 
     def _hardest_pressing_actor(self, bunch: int) -> str:
         """Returns the name of the actor that presses hardest on a bunch; empty if no actor does."""
@@ -339,6 +424,12 @@ class DetachmentMonitor:
             if self._bunch_of[contact.body] == bunch and contact.actor not in ("world", "plants"):
                 pushes[contact.actor] = pushes.get(contact.actor, 0.0) + float(np.linalg.norm(contact.force))
         return max(sorted(pushes), key=lambda actor: pushes[actor], default="")
+
+
+def _unit_poses(poses: np.ndarray) -> np.ndarray:
+    """Returns poses [k, 7] in double precision, with rotations of length 1."""
+    poses = poses.astype(float)
+    return frames.pose(poses[:, :3], frames.normalize(poses[:, 3:]))
 
 
 def _box_around(bunch: FreeBunch, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

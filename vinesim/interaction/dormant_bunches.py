@@ -11,6 +11,7 @@ import numpy as np
 from vinesim.contact.contact_solver import ContactSolver
 from vinesim.core import frames
 from vinesim.interaction.detachment import STUB_MASS
+from vinesim.interaction.stalk import leave_stump, stalk_below, with_settled_stalk
 from vinesim.interaction.support_tracking import SupportTracker
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.rigid.free_bunch import FreeBunch
@@ -81,12 +82,25 @@ class DormantBunches:
             plants.body_drag[bodies] = 0.0
             for body in bodies.tolist():
                 plants.set_mass(body, STUB_MASS)
+            for bunch in new:
+                self.restore_stalk(bunch)
         places = poses if places is None else places
         for bunch, support, pose, place in zip(bunches, supports, poses, places, strict=True):
             self._support[bunch] = support
             self._relative[bunch] = np.asarray(pose, float)
             self._place[bunch] = np.asarray(place, float)
         self._visuals = None
+
+    def restore_stalk(self, bunch: int) -> None:
+        """Give a dormant bunch the stalk that ``State.cut_segment`` names, if it names one."""
+        state = self.plants.state
+        segment = int(state.cut_segment[bunch])
+        if bunch in self._bunches and segment >= 0:
+            model = self.plants.model
+            at = float(state.cut_at[bunch])
+            leave_stump(self.plants, self.contact_solver, stalk_below(model, bunch, segment), at)
+            self._bunches[bunch] = with_settled_stalk(model, bunch, self._bunches[bunch], segment, at)
+            self._visuals = None
 
     def activate(self, bunches: list[int]) -> None:
         """Create MuJoCo bodies for ``bunches``, at their present poses and with the velocities of their supports."""
@@ -116,7 +130,10 @@ class DormantBunches:
         """Returns the visible shapes of all dormant bunches, as in :meth:`RigidWorld.visuals`."""
         if self._visuals is None:
             order = sorted(self._bunches)
-            self._visuals = tuple(RigidVisual(f"bunch/{i}", Organ.BUNCH, i, self._bunches[i].shapes) for i in order)
+            self._visuals = tuple(
+                RigidVisual(f"bunch/{i}", Organ.BUNCH, i, self._bunches[i].shapes, self._bunches[i].stalk)
+                for i in order
+            )
             supports = np.array([self._support[i] for i in order])
             poses = np.array([self._relative[i] for i in order]).reshape(-1, 7)
             rows_on = [(str(support), np.flatnonzero(supports == support)) for support in np.unique(supports)]

@@ -471,6 +471,16 @@ class ArticulationSolver:
             raise ValueError(f"body {body}: mass {mass} kg; leave a stub of a gram")
         self.berry_clusters.set_mass(body, mass)
 
+    def set_inertia(self, body: int, mass: float, com: np.ndarray, inertia: np.ndarray) -> None:
+        """Set mass [kg], centre of mass [3] m and moments of inertia about it [3] kg m^2 of one piece of wood, in its
+        frame, for example of the stump that a cut leaves."""
+        if not (0.0 < mass < math.inf and (np.asarray(inertia) > 0.0).all()):
+            raise ValueError(f"body {body}: mass {mass} kg, moments of inertia {inertia} kg m^2; both must be positive")
+        self.body_mass[body] = mass
+        self.body_com[body] = com
+        self.body_inertia[body] = inertia
+        self.launches.changed = True
+
     # ------------------------------------------------------------------ one step
 
     def predict(self, trees: np.ndarray | None = None) -> None:

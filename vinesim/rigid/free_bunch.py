@@ -17,7 +17,7 @@ from vinesim.core import frames
 from vinesim.rigid.static_world import ALL_BITS, CRATE_FLOOR, FREE_BUNCH, contact_friction, geom_user
 from vinesim.scene.materials import Material
 from vinesim.scene.physics_parameters import PhysicsParameters
-from vinesim.scene.values import Shape
+from vinesim.scene.values import Shape, Stalk
 
 MAX_GEOMS = 12
 """Largest number of collision shapes of a free bunch, and number of geoms of each body in the pool."""
@@ -59,6 +59,9 @@ GEOM_ARRAYS = (
     "geom_solref",
 )
 """Names of the arrays of ``MjModel`` with properties and derived constants of a geom."""
+_FRUIT = (0.25, 0.05, 0.3, 1.0)
+_STALK = (0.35, 0.45, 0.15, 1.0)
+"""Colours of the shapes of a free bunch and of its stalk, sRGB and opacity."""
 _Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
 
 
@@ -80,6 +83,8 @@ class FreeBunch:
     """[shape, 3] m, end of a capsule's axis."""
     radius: np.ndarray
     """[shape] m, radius of each sphere or capsule."""
+    stalk: Stalk | None = None
+    """Stalk above the bunch, whose pieces are the last shapes; None: it parted at its joint."""
 
     @functools.cached_property
     def shapes(self) -> tuple[Shape, ...]:
@@ -87,13 +92,14 @@ class FreeBunch:
         axis = self.end - self.start
         middle = 0.5 * (self.start + self.end)
         half = 0.5 * np.linalg.norm(axis, axis=-1)
-        rgba = (0.25, 0.05, 0.3, 1.0)
+        pieces = 0 if self.stalk is None else self.stalk.pieces
+        colours = [_FRUIT] * (len(self.radius) - pieces) + [_STALK] * pieces
         turn = frames.multiply(frames.from_x_axis(axis), _Z_TO_X)
         return tuple(
             Shape("capsule", (float(r), float(h)), frames.pose(p, q), rgba)
             if h > 0.0
             else Shape("sphere", (float(r),), frames.pose(p), rgba)
-            for r, h, p, q in zip(self.radius, half, middle, turn, strict=True)
+            for r, h, p, q, rgba in zip(self.radius, half, middle, turn, colours, strict=True)
         )
 
 

@@ -386,7 +386,7 @@ def list_visuals(
             visuals.append(RigidVisual(f"{name}/{part}", Organ.HUMAN, human.spec.index, shapes_of_part[part]))
             bodies.append(body)
     for bunch, (free, body) in bunches.items():
-        visuals.append(RigidVisual(f"bunch/{bunch}", Organ.BUNCH, bunch, free.shapes))
+        visuals.append(RigidVisual(f"bunch/{bunch}", Organ.BUNCH, bunch, free.shapes, free.stalk))
         bodies.append(body)
     return tuple(visuals), np.array(bodies, int)
 

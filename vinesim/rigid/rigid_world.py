@@ -643,6 +643,16 @@ class RigidWorld(MujocoWorld):
         for bunch, (_, pose, velocity) in bunches.items():
             self.place_bunch(bunch, pose, velocity)
 
+    def free_bunch(self, bunch: int) -> FreeBunch:
+        """Returns mass and shapes of a free bunch."""
+        return self._free_bunches[bunch]
+
+    def replace_bunch(self, bunch: int, body: FreeBunch) -> None:
+        """Give a free bunch other mass and shapes. It keeps its pose and velocity."""
+        self._free_bunches[bunch] = body
+        free_bunch.activate(self.mj_model, self._bunch_slot[bunch], body, self._derive(body))
+        self._update_tables()
+
     def place_bunch(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
         """Put a free bunch at ``pose`` [7] with ``velocity`` [6] in world axes, and wake it."""
         joint = self._bunch_joint(bunch)

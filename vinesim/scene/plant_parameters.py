@@ -8,12 +8,12 @@ import math
 import pathlib
 import re
 import typing
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
 from vinesim.core.data_files import find_data_file
-from vinesim.core.toml_loader import DataError, load_toml
+from vinesim.core.toml_loader import DataError, load_toml, read_toml, to_struct
 from vinesim.scene import plausibility
 
 AXIS_LENGTH = 0.05
@@ -76,6 +76,14 @@ class Cane(_Part, frozen=True, kw_only=True):
     lateral_length: Annotated[Range, "m"]
     lateral_diameter: Annotated[Number, "m"]
     drag: Annotated[Number, "1"]
+    lateral_place: Annotated[Range, "1"] = Range((6 / 14, 11 / 14), "1", "GUESSED", "as in vine.toml")
+    """Distance of a side shoot from the base of its shoot, as a share of the shoot's length."""
+    lean_along: Annotated[Number, "1"] = Number(0.12, "1", "GUESSED", "shoots of a hedge that was tucked in carefully")
+    """Standard deviation of the tangent of the angle at which a shoot of a hedge leaves the vertical, along the row."""
+    lean_across: Annotated[Number, "1"] = Number(0.05, "1", "GUESSED", "catch wires hold shoots in the hedge's plane")
+    """As ``lean_along``, across the row."""
+    crookedness: Annotated[Number, "1"] = Number(1.0, "1", "GUESSED", "bends by 4 degrees from one piece to the next")
+    """Bends between the pieces of a shoot of a hedge, in units of 0.07 along the row, 0.05 across and 0.03 upwards."""
 
 
 class Peduncle(_Part, frozen=True, kw_only=True):
@@ -88,6 +96,9 @@ class Peduncle(_Part, frozen=True, kw_only=True):
     damping: Annotated[Number, "s"]
     pull: Annotated[Range, "N"]
     bend_strength: Annotated[Number, "Pa"]
+    slant: Annotated[Range, "1"] = Range((0.1, 1.2), "1", "GUESSED", "stalks lead a bunch out beside what it hangs at")
+    """Least and greatest tangent of the angle between the upper half of the stalk and the vertical, where
+    ``Bunch.gap`` is given."""
 
 
 class Bunch(_Part, frozen=True, kw_only=True):
@@ -99,6 +110,12 @@ class Bunch(_Part, frozen=True, kw_only=True):
     length_range: Annotated[Range, "m"]
     stem_share: Annotated[Number, "1"]
     drag: Annotated[Number, "1"]
+    gap: Annotated[Number | None, "m"] = None
+    """Smallest level gap between the hulls of two bunches, and between a hull and wood or wires of its vine. Without it
+    bunches keep 20 mm between their bounding cylinders, and arms and shoots are not taken into account."""
+    press: Annotated[Number | None, "1"] = None
+    """Share of a hull's half axes by which shoots, stalks and wires may press into a bunch, where ``gap`` is given;
+    0 by default."""
 
 
 class Rachis(_Part, frozen=True, kw_only=True):
@@ -234,14 +251,33 @@ class Varieties(_Part, frozen=True, kw_only=True):
 
 @functools.cache
 def load_plant(name: str) -> VineParameters:
-    """Returns the parameters in the file ``name``, or else in the file of that name in ``data/plants``. Raises
+    """Returns the parameters in the file ``name``, or else in the file of that name in ``data/plants``. A file that
+    begins with ``like = "vine"`` has only the numbers that differ from those in that file. Raises
     :class:`DataError` if the file cannot be used, for example because a unit is wrong."""
     path = find_data_file("plants", name, ".toml")
-    vine = load_toml(path, VineParameters)
+    vine = to_struct(_plant_tables(path), VineParameters, str(path))
     _check_units(vine, str(path))
     for part in ("cane", "peduncle", "bunch", "rachis", "arm", "trunk"):
         _check_plausibility(getattr(vine, part), f"{path}: {part}")
     return vine
+
+
+def _plant_tables(path: pathlib.Path) -> dict[str, Any]:
+    """Returns the tables of a plant file. If ``like`` names another file, numbers that are missing are those there."""
+    tables = read_toml(path)
+    like = tables.pop("like", None)
+    if like is None:
+        return tables
+    if not isinstance(like, str):
+        raise DataError(f"{path}: like is {like!r}; give the name of another plant file in quotes")
+    other = find_data_file("plants", like, ".toml")
+    known = read_toml(other)
+    if "like" in known:
+        raise DataError(f"{path}: like is {like!r}, which is like a third file; name {known['like']!r} or a whole file")
+    for name, table in tables.items():
+        old = known.get(name)
+        known[name] = old | table if isinstance(old, dict) and isinstance(table, dict) else table
+    return known
 
 
 def load_varieties() -> tuple[Berry, ...]:

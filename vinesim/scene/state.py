@@ -34,6 +34,11 @@ class State(StructOfArrays):
     is one rigid body."""
     tree_awake: np.ndarray = array("tree", unit="1", dtype=np.bool_)
     bunch_attached: np.ndarray = array("bunch", unit="1", dtype=np.bool_, fill=1)
+    cut_segment: np.ndarray = array("bunch", unit="1", dtype=np.int32, fill=-1)
+    """Body of the segment of its peduncle in which each bunch was cut off; -1: it hangs, or has parted at its own
+    joint."""
+    cut_at: np.ndarray = array("bunch", unit="m")
+    """Distance of that cut from the segment's origin."""
 
     @classmethod
     def at_rest(cls, model: Model) -> State:

@@ -396,9 +396,12 @@ class PageWorld:
     def _lay_out_rigid(self, primitives: Primitives, snapshot: Snapshot, rows: slice) -> None:
         self._rigid_version += 1
         clusters = slice(len(primitives.cluster_first) - len(primitives.rigid_clusters), None)
+        stumps = _columns(primitives, primitives.stump_rows)
         self._rigid = array_message.encode(
             {"version": self._rigid_version, "names": [visual.name for visual in snapshot.visuals]},
-            _columns(primitives, rows) | _clusters(primitives, clusters, primitives.plant_count),
+            _columns(primitives, rows)
+            | _clusters(primitives, clusters, primitives.plant_count)
+            | {"stump_shape": stumps["shape"], "stump_carrier": stumps["carrier"]},
         )
 
     def take(self, page: int, said: PageInput) -> None:

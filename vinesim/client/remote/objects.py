@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection, Container, Iterable
 
 import numpy as np
 
+from vinesim.interaction.stalk import PLACE_STEP
 from vinesim.interaction.support_tracking import GROUND
 from vinesim.net.codec.control import RetainedRecord
 from vinesim.net.codec.trees import decode_trees
@@ -88,6 +89,8 @@ class ObjectSync:
         for record, holds in records:
             if is_tree(record.object):
                 self._apply_cuts(record)
+            elif record.stalk is not None:
+                self._apply_stalk(record.object, *record.stalk)
             known = newest.get(record.object)
             if known is None or (holds, known[0].claim) == (True, record.claim) or wins(record.claim, known[0].claim):
                 newest.pop(record.object, None)
@@ -162,6 +165,20 @@ class ObjectSync:
         for body in record.cut:
             if self.physics.model.body_tree[body] == record.object and not self.physics.state.body_cut[body]:
                 self.apply_remote_cut(body)
+
+    def _apply_stalk(self, number: int, segment: int, steps: int) -> None:
+        """Cut a bunch where its record names the cut, or give a bunch that was cut before its record came the stalk
+        that it has. A record that names no place on the bunch's peduncle counts as one without a stalk."""
+        kind, bunch = split_object_id(number)
+        if kind == ObjectKind.BUNCH:
+            self.physics.apply_remote_stalk(bunch, segment, PLACE_STEP * steps)
+
+    def stalk_of(self, number: int) -> tuple[int, int] | None:
+        """Returns where a bunch was cut in its peduncle, as its record names it; None without a stalk."""
+        kind, bunch = split_object_id(number)
+        if kind != ObjectKind.BUNCH or (segment := int(self.physics.state.cut_segment[bunch])) < 0:
+            return None
+        return segment, round(float(self.physics.state.cut_at[bunch]) / PLACE_STEP)
 
     def _apply_tree_record(self, record: RetainedRecord) -> list[TreeUpdate]:
         """Apply the state of a tree in a record. Returns that state if the tree rests in it."""

@@ -124,6 +124,9 @@ class RetainedRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknow
     place: tuple[float, float, float, float, float, float, float] | None = None
     """For an object that rests on a link of a robot: pose in the world when the record was published, position [m] and
     quaternion xyzw. Clients use this pose if the robot has left."""
+    stalk: tuple[int, int] | None = None
+    """For a bunch that was cut in its peduncle: body of the segment in which it was cut, and place of the cut along it
+    [0.1 mm]."""
 
     @property
     def claim(self) -> Claim:
@@ -251,6 +254,8 @@ def decode_records(payload: bytes, counts: tuple[int, ...] | None = None) -> lis
                 raise MessageError(f"record of object {record.object} with orientation {pose[3:]}, no unit quaternion")
         if len(record.parent) > 200 or len(record.cut) > MAX_BODIES or any(body < 0 for body in record.cut):
             raise MessageError(f"record of object {record.object} with an impossible parent or list of cut bodies")
+        if record.stalk is not None and not (record.stalk[0] >= 0 and 0 < record.stalk[1] < 1 << 16):
+            raise MessageError(f"record of object {record.object} with an impossible stalk {record.stalk}")
     return records
 
 

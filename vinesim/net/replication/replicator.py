@@ -221,6 +221,7 @@ class Replicator:
         has_body: Callable[[int], bool] = lambda _: True,
         messages: Mapping[int, Any] = MappingProxyType({}),
         carried_on: Iterable[int] = (),
+        stalk_of: Callable[[int], tuple[int, int] | None] = lambda _: None,
     ) -> list[TreeUpdate]:
         """Publish the results of one step. Returns the states of trees at rest that were sent, as all receivers decode
         them.
@@ -242,6 +243,8 @@ class Replicator:
           (:meth:`vinesim.net.replication.direct_messages.MessageSync.publish`).
         * ``carried_on``: objects at rest on this actor that it has carried so far that their records shall be published
           again, with the present place.
+        * ``stalk_of(object_id)``: where a bunch was cut in its peduncle
+          (:attr:`vinesim.net.codec.control.RetainedRecord.stalk`).
         """
         state = self._state
         self._follow_clock()
@@ -269,6 +272,7 @@ class Replicator:
                 is_changed,
                 has_body,
                 carried_on,
+                stalk_of,
             )
         )
 

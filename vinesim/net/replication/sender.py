@@ -57,6 +57,7 @@ class LocalStep:
     is_changed: Callable[[int], bool]
     has_body: Callable[[int], bool]
     carried_on: set[int]
+    stalk_of: Callable[[int], tuple[int, int] | None]
 
 
 class Sender:
@@ -322,6 +323,7 @@ class Sender:
         record = RetainedRecord(
             object_id, claim.ownership, claim.authority, state.hello.name, _within_range(pose), parent
         )
+        record = msgspec.structs.replace(record, stalk=step.stalk_of(object_id))
         if parent and parse_object_name(parent) is None:
             record = msgspec.structs.replace(record, place=_within_range(step.read(object_id)[0]))
         state.retained.publish(state.object_stream.cells((object_id,))[0], record)
@@ -339,7 +341,7 @@ class Sender:
             return
         state.object_stream.positions((object_id,), step.read)
         pose, _ = step.read(object_id)
-        record = msgspec.structs.replace(record, pose=_within_range(pose))
+        record = msgspec.structs.replace(record, pose=_within_range(pose), stalk=step.stalk_of(object_id))
         state.retained.publish(state.object_stream.cells((object_id,))[0], record)
 
     def _publish_tree_record(self, cell: Cell, record: RetainedRecord, step: LocalStep) -> None:

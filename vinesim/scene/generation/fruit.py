@@ -85,7 +85,7 @@ def sample_fruit(
     low, high = parameters.cane.first_bunch_node.value
     node = low + (high - low) * uniform()
     node = np.stack([node, node + 2.2], -1)
-    at = np.clip(np.round(node / nodes[:, None] * AXIS_SEGMENTS).astype(int) - 1, 1, AXIS_SEGMENTS - 2)
+    at = np.clip(np.round(node / nodes[:, None] * AXIS_SEGMENTS).astype(int) - 1, 0, AXIS_SEGMENTS - 2)
     at[:, 1] = np.maximum(at[:, 1], at[:, 0] + 1)
     rows = np.arange(len(points))[:, None]
     top = points[rows, at + 1]

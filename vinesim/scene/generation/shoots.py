@@ -9,6 +9,7 @@ import numpy as np
 
 from vinesim.core import frames, portable_math
 from vinesim.scene import builder
+from vinesim.scene.generation.close_bunches import Canes, hang_bunches
 from vinesim.scene.generation.fixed_structure import FixedStructure
 from vinesim.scene.generation.fruit import choose_bunches, sample_fruit
 from vinesim.scene.generation.old_wood import seat_on_spurs
@@ -106,15 +107,18 @@ def sample_shoots(scene: Scene, parameters: VineParameters, structure: FixedStru
         heading = np.stack([np.cos(turn), np.sin(turn), -0.38 + 0.15 * uniform()], -1)
         up = np.broadcast_to([0.0, 0.0, 1.0], (count, 3))
     else:
-        lean = normal(2) * [0.12, 0.05]
+        lean = normal(2) * [cane.lean_along.value, cane.lean_across.value]
         across = frames.cross(np.array([0.0, 0.0, 1.0]), along)
         heading = along * lean[:, :1] + across * lean[:, 1:] + [0.0, 0.0, 1.0]
         up = along
     owner = np.repeat(np.arange(vines), per_vine)
-    points = _grow_main_axis(scene, start, heading, length, normal(AXIS_SEGMENTS, 3), structure.foot[owner])
+    noise = normal(AXIS_SEGMENTS, 3)
+    if not tendone:
+        noise = noise * cane.crookedness.value
+    points = _grow_main_axis(scene, start, heading, length, noise, structure.foot[owner])
 
     has_lateral = uniform() < cane.lateral_share.value
-    lateral_at = 6 + (5 * uniform()).astype(int)
+    lateral_at = (AXIS_SEGMENTS * cane.lateral_place.at(uniform())).astype(int)
     lateral_length = cane.lateral_length.at(uniform())
     sign = np.where(uniform() < 0.5, 1, -1)
     lateral_points = _grow_lateral(points, lateral_at, up, lateral_length, sign, normal(LATERAL_SEGMENTS, 3))
@@ -127,7 +131,13 @@ def sample_shoots(scene: Scene, parameters: VineParameters, structure: FixedStru
     rise = np.maximum(peduncle[:, :, 0, 2] - points[:, :1, 2], 0.0)
     stiffness = cane.woody_modulus.value * np.pi / 4.0 * portable_math.power(base, 4)
     burden = fruit["mass"] * -builder.GRAVITY[2] * rise**2 / stiffness[:, None]
-    chosen = choose_bunches(scene, structure, per_vine, peduncle, burden, fruit)
+    if parameters.bunch.gap is None:
+        chosen = choose_bunches(scene, structure, per_vine, peduncle, burden, fruit)
+    else:
+        canes = Canes(points, base, lateral_points, 0.5 * cane.lateral_diameter.value, has_lateral)
+        chosen, peduncle, bunch_up = hang_bunches(
+            scene, parameters, structure, canes, peduncle, bunch_axis, bunch_up, burden, fruit
+        )
     leaf_normal = np.moveaxis(normal(MAX_NODES + LATERAL_NODES, 8), -1, 0)
     leaf_uniform = np.moveaxis(uniform(MAX_NODES + LATERAL_NODES, 4), -1, 0)
     return Shoots(

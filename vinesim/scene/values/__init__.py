@@ -7,7 +7,7 @@ Times are in seconds of simulated time. Arrays are NumPy arrays; poses [7] are p
 from vinesim.scene.values.human import POINT_NAMES, HandSample, Haptic, HumanPose, HumanSpec
 from vinesim.scene.values.measurement import Measurement
 from vinesim.scene.values.network import HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpdate
-from vinesim.scene.values.rigid import Mesh, RigidBox, RigidVisual, Shape
+from vinesim.scene.values.rigid import Mesh, RigidBox, RigidVisual, Shape, Stalk
 from vinesim.scene.values.robot import (
     FORWARD_KINDS,
     ControllerKind,
@@ -116,6 +116,7 @@ __all__ = [
     "SensorPacing",
     "Shape",
     "Snapshot",
+    "Stalk",
     "TreeUpdate",
     "WindState",
     "Wrench",

@@ -55,6 +55,18 @@ class RigidBox:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
+class Stalk:
+    """Where a bunch was cut in its peduncle. It has the stalk beyond the cut; the stump stays on the vine."""
+
+    segment: int
+    """Body of the segment of the peduncle that was cut."""
+    at: float
+    """[m] Distance of the cut from the segment's origin."""
+    pieces: int
+    """Number of pieces of the stalk: the last shapes of the free bunch, from the cut to the bunch."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
 class RigidVisual:
     """One visible rigid body for pictures, scans and the web page: name, organ, index and shapes."""
 
@@ -64,3 +76,5 @@ class RigidVisual:
     index: int
     """Index of the robot, person or box in label images (:func:`vinesim.scene.ids.label`)."""
     shapes: tuple[Shape, ...]
+    stalk: Stalk | None = None
+    """Stalk of a bunch that was cut in its peduncle."""

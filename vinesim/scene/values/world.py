@@ -99,3 +99,8 @@ class Detachment:
     """[3] N, last force of the joint on the detached part, world axes."""
     moment: np.ndarray
     """[3] N m, last moment about the joint on the detached part."""
+    segment: int = -1
+    """Index of the body of the peduncle in which a blade has cut a bunch off; -1: the part was detached at its joint.
+    """
+    at: float = 0.0
+    """[m] Distance of the cut from the origin of ``segment``."""

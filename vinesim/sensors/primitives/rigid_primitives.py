@@ -56,6 +56,16 @@ def rigid_batches(
             on = np.full(len(place), first + k)
             mine = bunch_batches(model, which, [place], [on], np.array([groups + k]), ripeness)
             batches += [dataclasses.replace(b, bunch=np.full(len(b), -1)) for b in mine]
+            if visual.stalk is not None:
+                common = {
+                    "material": int(materials.STEM),
+                    "tint": np.array(model.look.palette.wood.stem),
+                    "organ": int(Organ.PEDUNCLE),
+                    "label": label(Organ.PEDUNCLE, visual.index),
+                    "carrier": first + k,
+                    "group": groups + k,
+                }
+                batches += [_rigid_shape(piece, common) for piece in visual.shapes[-visual.stalk.pieces :]]
             continue
         usual = _DEFAULT_SURFACE.get(visual.organ, "paint")
         name = label(visual.organ, visual.index)

@@ -22,7 +22,7 @@ from vinesim.scene.ids import LABEL_STRIDE, NO_OBJECT, Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 from vinesim.scene.terrain import Terrain
-from vinesim.scene.values import RigidVisual, Shape, Snapshot
+from vinesim.scene.values import RigidVisual, Shape, Snapshot, Stalk
 from vinesim.sensors.primitives import textures
 from vinesim.sensors.primitives.bunch_primitives import Ripeness, bunch_batches, bunch_bodies
 from vinesim.sensors.primitives.clutter import clutter_batches
@@ -58,6 +58,9 @@ _PRIMITIVE_COLUMNS = {
 }
 """Columns of the table of primitives: name -> type. Columns ``local_*`` are in the frame of the carrier, ``a`` to ``d``
 in the world."""
+_NOTHING = 1e-6
+"""Radius [m], and share of its length, with which a segment that has left the vine is drawn there: too small to be
+seen."""
 _ONLY_IN_COLUMNS = ("a", "b", "c", "d", "material", "tint", "organ", "label", "carrier")
 """Fields of :class:`ClusterLayout` with a value for each primitive; after loading they are only in the device's
 columns."""
@@ -113,6 +116,12 @@ class Primitives:
         self._visuals: tuple[RigidVisual, ...] = ()
         self._attached = np.ones(len(model.bunch_body), bool)
         self._picked_shapes: dict[int, np.ndarray] = {}
+        self._stumps: dict[Stalk, dict[int, np.ndarray]] = {}
+        """For each cut stalk, the drawn ends [2, 4] of its peduncle's segments before the cut, by primitive."""
+        self.stump_rows = np.zeros(0, np.int64)
+        """Primitives [k] of plants that a cut has ever shortened, ascending."""
+        self._stump_trees = np.zeros(0, np.int64)
+        """Trees [k] whose stumps the last change of rigid bodies has changed."""
         self._rigid: dict[tuple[Organ, int, int], tuple[tuple[Shape, ...], ClusterLayout | None]] = {}
         """Shapes and clusters of each rigid body, by organ, index and identity of the tuple of shapes."""
         self._moved = np.zeros(0, np.int64)
@@ -311,7 +320,48 @@ class Primitives:
         self._poses = self._pose_array.numpy() if self._pose_array.device.is_cpu else poses
         """[carrier, 7] World pose of each carrier. On a CPU this is the memory that kernels read."""
         self._visuals = visuals
+        self._draw_stumps({visual.stalk for visual in visuals if visual.stalk is not None})
         self.layout_version += 1
+
+    def _draw_stumps(self, stalks: set[Stalk]) -> None:
+        """Draw of each peduncle that was cut only the stump; the bunch carries the rest. Peduncles that are whole again
+        in a world that was set back are drawn whole."""
+        changed = stalks ^ self._stumps.keys()
+        below = {stalk: self._segments_below(stalk) for stalk in changed}
+        cut = np.array([segments[0] for segments in below.values()], int)
+        self._stump_trees = np.unique(self.model.body_tree[cut])
+        if not changed:
+            return
+        carrier, kind = (self._columns[name][: self.plant_count].numpy() for name in ("carrier", "kind"))
+        ends = [self._columns[f"local_{name}"] for name in "ab"]
+        for stalk, segments in below.items():
+            if stalk in self._stumps:
+                for row, whole in self._stumps.pop(stalk).items():
+                    for column, end in zip(ends, whole, strict=True):
+                        column[row : row + 1].assign(end[None])
+                continue
+            kept = self._stumps[stalk] = {}
+            for body in segments:
+                for row in np.flatnonzero((carrier == body) & (kind == CONE)).tolist():
+                    start, end = (column[row : row + 1].numpy()[0].copy() for column in ends)
+                    kept[row] = np.stack([start, end])
+                    share = stalk.at / float(self.model.body_length[body]) if body == stalk.segment else _NOTHING
+                    shown = start + share * (end - start)
+                    if body != stalk.segment:
+                        start[3] = shown[3] = _NOTHING
+                    for column, value in zip(ends, (start, shown), strict=True):
+                        column[row : row + 1].assign(value[None])
+            self.stump_rows = np.union1d(self.stump_rows, list(kept))
+
+    def _segments_below(self, stalk: Stalk) -> list[int]:
+        """Returns the segments of a peduncle from the one that was cut to the bunch."""
+        model = self.model
+        found = [stalk.segment]
+        while len(child := np.flatnonzero(model.body_parent == found[-1])) and (
+            model.body_organ[child[0]] == int(Organ.PEDUNCLE)
+        ):
+            found.append(int(child[0]))
+        return found
 
     def _lay_out_rigid(self, visuals: tuple[RigidVisual, ...]) -> list[tuple[int, ClusterLayout]]:
         """Returns carrier (index of the pose that moves a body) and clusters of each rigid body in ``visuals`` that has
@@ -421,6 +471,7 @@ class Primitives:
             # the snapshot of a new world, or of a world that was set back, may not list all trees that moved
             differs = (np.asarray(body_q, np.float32) != self._poses[: self._bodies]).any(1)
             trees = np.union1d(trees, self.model.body_tree[differs])
+            trees = np.union1d(trees, self._stump_trees)
         attached = np.asarray(snapshot.bunch_attached, bool)
         changed = np.flatnonzero(attached != self._attached)
         if len(changed):

@@ -280,6 +280,7 @@ export class World {
       count = arrays.material.length;
     if (this.plants + count > this.rows) throw new Error(`${count} rigid primitives; there is room for ${RIGID_ROOM}`);
     this.write(arrays, this.plants);
+    this.drawStumps(arrays);
     this.rigidClusters = clusters(arrays);
     this.names = header.names;
     this.listedAway.clear();
@@ -294,6 +295,16 @@ export class World {
     this.surfaces.clearUpdateRanges(); // all of it
     this.shapes.needsUpdate = this.surfaces.needsUpdate = true;
     this.listedAt = null;
+  }
+
+  /** Set the shapes of peduncles that were cut, or are whole again. A segment of a peduncle is one primitive. */
+  drawStumps({ stump_shape, stump_carrier }) {
+    if (stump_carrier.length === 0) return;
+    const number = new Map(Array.from(stump_carrier, (carrier, k) => [carrier, k]));
+    for (let row = 0; row < this.plants; ++row) {
+      const k = number.get(this.surfaces.image.data[4 * row + 2]);
+      if (k !== undefined) this.shapes.image.data.set(stump_shape.subarray(16 * k, 16 * k + 16), 16 * row);
+    }
   }
 
   /** Set the poses of moved trees, and the picked bunches. */
