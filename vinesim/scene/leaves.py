@@ -34,7 +34,7 @@ class _Lobing:
     """Half width of a sinus [rad]."""
 
 
-_LOBINGS = (_Lobing(2.0, 0.05, 0.03, 0.16), _Lobing(6.0, 0.20, 0.10, 0.17), _Lobing(9.0, 0.44, 0.26, 0.15))
+_LOBINGS = (_Lobing(2.0, 0.06, 0.04, 0.16), _Lobing(6.0, 0.26, 0.15, 0.17), _Lobing(9.0, 0.50, 0.32, 0.16))
 _VARIANTS = 4
 """Number of outlines of each depth of sinus: two whole ones, one with holes, one with a torn lobe."""
 SHAPE_COUNT = len(_LOBINGS) * _VARIANTS
@@ -48,14 +48,14 @@ _BLADE = (
     (112.0, 0.82), (135.0, 0.72), (152.0, 0.64), (165.0, 0.52), (174.0, 0.22), (180.0, 0.06),
 )  # fmt: skip
 """Angle from the midrib [deg] and radius of the blade without sinuses, in units of the midrib."""
-_TIPS = ((0.0, 0.06), (52.0, 0.05), (112.0, 0.03))
+_TIPS = ((0.0, 0.16), (52.0, 0.13), (112.0, 0.08))
 """Angle [deg] of the lobes' tips, and by how much the tips stand out."""
 _SINUSES = (27.0, 84.0)
 """Angles of the upper and lower lateral sinuses [deg]."""
 _PETIOLE_SINUS = np.radians(163.0)
 """Angle from which on there are no teeth."""
 _TOOTH_WIDTH = (0.06, 0.13)
-_TOOTH_LENGTH = (0.022, 0.055)
+_TOOTH_LENGTH = (0.03, 0.065)
 """Range of the widths and lengths of teeth, in units of the midrib: GUESSED."""
 _KNOTS = 4096
 
