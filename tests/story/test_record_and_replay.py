@@ -213,6 +213,10 @@ def test_a_truncated_recording_is_replayed_to_a_viewer(killed_recording, listen)
     assert len(viewer.received) > 20
 
 
+POSE_SIZE = 56
+"""Bytes of a pose of a client that moves nothing."""
+
+
 def count_bytes(endpoint: str, path: pathlib.Path | None, distance: float) -> list[int]:
     """Payload bytes that two clients send in 200 ticks of touching, with a recorder if ``path`` is given.
 
@@ -279,7 +283,8 @@ def test_a_recorder_does_not_change_traffic(tmp_path, distance):
         path = tmp_path / "run.mcap"
         without_recorder = count_bytes(server.endpoint, None, distance)
         with_recorder = count_bytes(server.endpoint, path, distance)
-    assert without_recorder == with_recorder
+    # two runs begin at different phases of the poses' period, so one pose more may be due in one of them
+    assert np.abs(np.subtract(without_recorder, with_recorder)).max() <= POSE_SIZE
     recorded = {entry.key for entry in read_recording(path).messages}
     assert ("tree/0/0/ada" in recorded) == (distance < 5.0)
     assert "a/ada/far" in recorded
