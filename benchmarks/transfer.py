@@ -81,7 +81,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     },
     "seed": {"type": int, "default": 1, "help": "seed of the first training"},
     "device": {"help": "device of PyTorch (default: cuda)"},
-    "out": {"help": "folder for transfer.md, transfer.json and pictures of what was found"},
+    "out": {"help": "folder for transfer.md, transfer.json and pictures with the blobs found"},
 }
 """Options of the command line, by name without dashes."""
 

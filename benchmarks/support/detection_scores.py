@@ -13,7 +13,7 @@ from benchmarks.support.bunch_pictures import BunchPicture
 THRESHOLD = 0.5
 """Probability from which on a pixel counts as one of a bunch."""
 LEVELS = 1024
-"""Number of probabilities that are told apart."""
+"""Number of different probabilities."""
 HIT_SHARE = 0.25
 """Share of a box from which on it counts as found."""
 MIN_BLOB_SHARE = 1e-4

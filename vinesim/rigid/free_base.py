@@ -53,7 +53,8 @@ class FreeBase:
 
     def take_over(self, other: FreeBase) -> None:
         """Copy the goal of ``other``, the base of the same robot with other shapes."""
-        self._goal, self._goal_velocity = other._goal, other._goal_velocity
+        self._goal = other._goal
+        self._goal_velocity = other._goal_velocity
 
     def place(self, d: mujoco.MjData, pose: np.ndarray) -> None:
         """Put the base at ``pose`` [7], at rest."""

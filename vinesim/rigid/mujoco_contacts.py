@@ -140,9 +140,12 @@ def lowest_point(parsed: mujoco.MjSpec, given: RobotSpec) -> float | None:
     base.add_freejoint()  # MuJoCo finds no contacts between two fixed bodies
     world.attach(parsed.copy(), prefix="robot/", frame=base.add_frame())
     for geom in world.geoms:
-        geom.contype, geom.conaffinity = 1, 0
+        geom.contype = 1
+        geom.conaffinity = 0
     plane = world.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0.0, 0.0, -FAR])
-    plane.contype, plane.conaffinity, plane.margin = 0, 1, 2.0 * FAR
+    plane.contype = 0
+    plane.conaffinity = 1
+    plane.margin = 2.0 * FAR
     distance = _collide_at_home(compile_without_contacts(world), given, "robot/").contact.dist
     return float(distance.min()) - FAR if len(distance) else None
 

@@ -27,7 +27,8 @@ _GEOM = {"friction": "1 0.005 0.0001"}
 """MuJoCo's defaults of geoms that documents of vineyards change."""
 _COPIED = ("default", "asset", "worldbody", "contact", "equality", "actuator")
 """Sections of a document whose elements are added to those of another document."""
-_ON_GROUND, _ABOVE_GROUND = 1, 2
+_ON_GROUND = 1
+_ABOVE_GROUND = 2
 """Collision bits of shapes that touch the ground, and of those of a driven base, which do not."""
 
 

@@ -199,7 +199,7 @@ def assemble(
     ties: Sequence[Tie] = (),
     boxes: Sequence[Box] = (),
 ) -> Model:
-    """Returns one model of canes, and of what surrounds them. Each cane is a tree; trees, wires and boxes are numbered
+    """Returns one model of canes and their surroundings. Each cane is a tree; trees, wires and boxes are numbered
     in the given order. Raises :class:`ValueError` if a tie names a cane, place or wire that does not exist."""
     trees = [one.tree() if isinstance(one, CaneBuilder) else one for one in canes]
     if not (wires or ties or boxes):

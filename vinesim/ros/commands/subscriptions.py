@@ -135,7 +135,9 @@ class CommandSubscriptions:
                 self._subscribe(JointState, spec.hardware.commands, take)
 
     def _subscribe_controller(self, spec: ControllerSpec) -> None:
-        name, kind, joints = spec.name, spec.kind, spec.joints
+        name = spec.name
+        kind = spec.kind
+        joints = spec.joints
         if kind is ControllerKind.JOINT_TRAJECTORY:
             take = partial(convert.joint_trajectory, controller=name, known=joints, renamed=spec.renamed)
             self._subscribe(JointTrajectoryMessage, f"{name}/joint_trajectory", take)

@@ -214,7 +214,8 @@ def _wood_of(
     """Returns points [n, 3] m in the wood on the plot of a vine and the radii [n] m there: first for old wood and
     poles, then for shoots and wires. ``half`` [2] m: half the size of a plot."""
     arms = structure.arms.shape[1]
-    organ, index = fixed["fixed_organ"], fixed["fixed_index"]
+    organ = fixed["fixed_organ"]
+    index = fixed["fixed_index"]
     foot = structure.foot[vine]
     middle = 0.5 * (fixed["fixed_start"] + fixed["fixed_end"])
     mine = (organ == int(Organ.TRUNK)) & (index == vine)

@@ -47,7 +47,8 @@ def seat_on_spurs(scene: Scene, structure: FixedStructure, each: int) -> SpurSea
     number = np.arange(each) // SHOOTS_ON_SPUR
     last = np.arange(each) % SHOOTS_ON_SPUR - 0.5
     upright = scene.training == "vsp"
-    share, offset = [], []
+    share = []
+    offset = []
     rngs = vine_generators(scene, structure.row, structure.place, 2)
     for vine in range(vines):
         g = rngs[vine]
@@ -87,12 +88,14 @@ def with_old_wood(scene: Scene, structure: FixedStructure, start: np.ndarray) ->
     for vine in range(vines):
         g = rngs[vine]
         for arm in range(count):
-            axis, radius = structure.arms[vine, arm], structure.arm_radius[vine, arm]
+            axis = structure.arms[vine, arm]
+            radius = structure.arm_radius[vine, arm]
             index = vine * count + arm
             for first in range(0, each, SHOOTS_ON_SPUR):
                 _add_spur(pieces, g, age, axis, radius, start[vine, arm, first : first + SHOOTS_ON_SPUR], index)
             _add_lumps(pieces, g, age, axis, radius, _ARM_BURLS, _ARM_STUBS, Organ.ARM, index)
-        axis, radius = structure.trunk[vine], structure.trunk_radius[vine]
+        axis = structure.trunk[vine]
+        radius = structure.trunk_radius[vine]
         _add_lumps(pieces, g, age, axis, radius, _TRUNK_BURLS, _TRUNK_STUBS, Organ.TRUNK, vine)
     added = pieces.arrays()
     fixed = {name: np.concatenate([value, added[name]]) for name, value in structure.fixed.items()}
@@ -135,7 +138,8 @@ def _add_spur(
     """Add the spur head below ``shoots`` [1 or 2, 3] m, which stand on the arm with points ``axis`` and ``radius``."""
     middle = shoots.mean(0)
     nearest = int(np.argmin(((axis - middle) ** 2).sum(1)))
-    foot, thick = axis[nearest], float(radius[nearest])
+    foot = axis[nearest]
+    thick = float(radius[nearest])
     # the foot of the spur is straight below the shoots, between the points of the axis
     way = axis[min(nearest + 1, len(axis) - 1)] - axis[max(nearest - 1, 0)]
     way = frames.normalize(way)

@@ -213,7 +213,8 @@ def _tree(
         nodes = find_nodes(points.parent, points.radius, way, inside, parameters.cane)
         body = np.array([bodies[piece] for piece in nodes.piece.tolist()], int)
         turn = np.array([turns[piece] for piece in nodes.piece.tolist()], float).reshape(-1, 4)
-        start, end = place[points.parent[nodes.piece]], place[nodes.piece]
+        start = place[points.parent[nodes.piece]]
+        end = place[nodes.piece]
         reach = np.linalg.norm(start + nodes.share[:, None] * (end - start) - place[below], axis=1)
         add_leaves(tree, nodes, body, turn, reach, leaves[0], parameters.leaf, leaves[1])
     return tree

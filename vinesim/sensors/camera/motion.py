@@ -35,7 +35,7 @@ class Motion:
     """Moves the primitives to their poses at a time [s] after the middle of the exposure; None: the scene is at rest.
     It is called with 0 at the end."""
     scene_speed: float = 0.0
-    """Largest speed of what ``pose_scene`` moves [m/s]; it determines the number of moments."""
+    """Largest speed of the bodies that ``pose_scene`` moves [m/s]; it determines the number of moments."""
 
     def pose_at(self, pose: np.ndarray, time: float) -> np.ndarray:
         """Returns the pose [7] of the camera ``time`` [s] after it was at ``pose`` [7]."""
@@ -79,7 +79,8 @@ class Moments:
             weights = np.zeros((count, height))
             weights[nearest, np.arange(height)] = 1.0
             return cls(times, weights, nearest)
-        begin, end = middle - 0.5 * exposure_time, middle + 0.5 * exposure_time
+        begin = middle - 0.5 * exposure_time
+        end = middle + 0.5 * exposure_time
         covered = np.minimum(end, times[:, None] + 0.5 * step) - np.maximum(begin, times[:, None] - 0.5 * step)
         weights = np.maximum(covered, 0.0)
         return cls(times, weights / weights.sum(0), nearest)

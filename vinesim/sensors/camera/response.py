@@ -98,7 +98,8 @@ class ColourSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     def tone_curve(self) -> np.ndarray:
         """Returns the tone curve [4096]: 8-bit value by the square root of light from 0 to the clipping point."""
         light = (np.arange(TONE_ENTRIES) / (TONE_ENTRIES - 1.0)) ** 2
-        s, toe = self.shoulder.value, self.toe.value
+        s = self.shoulder.value
+        toe = self.toe.value
         light = light * (1.0 + s) / (1.0 + s * light)
         light = light * light * (1.0 + toe) / np.maximum(light + toe, 1e-12)
         seen = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)

@@ -60,7 +60,7 @@ def clutter_batches(
 ) -> list[Batch]:
     """Returns the primitives of all clutter of a model except distant rows; none for a model without clutter.
 
-    ``segments``: the wires; ``static_carrier``: carrier of what never moves, which follows the carriers of the wires;
+    ``segments``: the wires; ``static_carrier``: carrier of static primitives, which follows the carriers of the wires;
     ``low``, ``high``: [2] m corners of the area with vines.
     """
     clutter = model.look.clutter
@@ -137,7 +137,8 @@ def _chains(
     """Returns round cones along polylines ``points`` [n, point, 3] m with ``radius`` [n, point] m; all other properties
     are [n] or for all. Without ``group`` cones are grouped by squares of ground."""
     count, pieces = len(points), points.shape[1] - 1
-    a, b = points[:, :-1].reshape(-1, 3), points[:, 1:].reshape(-1, 3)
+    a = points[:, :-1].reshape(-1, 3)
+    b = points[:, 1:].reshape(-1, 3)
     step = np.linalg.norm(points[:, 1:] - points[:, :-1], axis=2)
 
     def each(values: int | np.ndarray) -> np.ndarray:
