@@ -18,8 +18,12 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CameraInfo, Image
 
-VIVIDNESS = 2.5
+VIVIDNESS = 2.2
 """Factor on the distance of a colour from grey: a D435 has pale colours."""
+
+
+FARTHEST = 2.5
+"""Distance [m] beyond which yellow leaves look like bunches."""
 
 
 class BunchFinder(Node):
@@ -50,9 +54,13 @@ def find(picture: np.ndarray, metres: np.ndarray, k: np.ndarray) -> list[np.ndar
     grey = smooth.mean(axis=2, keepdims=True)
     red, green, blue = np.moveaxis(grey + VIVIDNESS * (smooth - grey), 2, 0)
     amber = (abs(red - green) < 0.1 * green) & (blue < 0.65 * green)
-    fruit = (amber | ((red > 1.3 * green) & (blue > green - 8))) & (metres > 0.0) & (metres < 3.0)
-    fruit = cv2.morphologyEx(fruit.astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+    fruit = (amber | ((red > 1.3 * green) & (blue > green - 8))).astype(np.uint8)
+    fruit = cv2.morphologyEx(fruit, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
     fruit = cv2.morphologyEx(fruit, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8))
+    # a bunch ends where the distance jumps
+    distance = np.nan_to_num(metres, nan=0.0, posinf=0.0, neginf=0.0)
+    jump = cv2.morphologyEx(distance, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
+    fruit[(distance == 0.0) | (distance > FARTHEST) | (jump > 0.05)] = 0
     count, pieces = cv2.connectedComponents(fruit)
     places = []
     for piece in range(1, count):

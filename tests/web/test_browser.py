@@ -601,7 +601,8 @@ def test_controls_fit_on_desktops_and_phones_and_are_reached_by_keys(page, is_pe
             "between": ["", ""],
             "said": ["The shears in the left hand missed: there was no wood.", "They cut 1 bunch."],
         }
-        page.run(f"(({{ shears }}) => {{ shears.closures = 0; shears.take({{ shears: {told} }}); }})(vinesim.viewer)")
+        state = {"shears": told, "held": ["", ""]}
+        page.run(f"(({{ shears }}) => {{ shears.closures = 0; shears.take({state}); }})(vinesim.viewer)")
         page.run("document.getElementById('timeline').hidden = false")
         for width, height in ((1280, 720), (1024, 600), (844, 390), (390, 844)):
             page.resize(width, height)
