@@ -102,7 +102,7 @@ def load_description(
     ``is_remote``: whether the URDF was received over the network. Then no file that it names is opened, and its meshes
     are taken from ``received`` (digest -> corners [face, 3, 3] m); other meshes become boxes. ``sidecar``: replaces the
     TOML file. ``srdf``: path of the SRDF, instead of the one beside the file. ``xacro_args``: arguments of a xacro
-    file, each ``NAME:=VALUE``. ``base``: how the base moves; ``auto``: as the TOML file says
+    file, each ``NAME:=VALUE``. ``base``: how the base moves; "auto": as the TOML file says
     (:attr:`BaseLimits.kind`). Raises :class:`DescriptionError`, with one line of text, if the robot cannot be
     simulated.
     """
