@@ -100,7 +100,8 @@ class Detachment:
     moment: np.ndarray
     """[3] N m, last moment about the joint on the detached part."""
     segment: int = -1
-    """Index of the body of the peduncle in which a blade has cut a bunch off; -1: the part was detached at its joint.
+    """Index of the body of wood that was cut: a segment of the peduncle of a bunch, or the body of a cane, which is the
+    root of what falls. -1: the part was detached at its joint.
     """
     at: float = 0.0
     """[m] Distance of the cut from the origin of ``segment``."""
