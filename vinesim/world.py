@@ -256,6 +256,7 @@ class Physics:
             moved_trees=np.union1d(self.plants.awake, self.remotely_posed),
             wind=self.wind_on_plants.state,
             wires=self.wire_shapes.poses(),
+            stumps=self.plants.stumps.table,
         )
 
     def visuals(self) -> tuple[RigidVisual, ...]:

@@ -991,6 +991,8 @@ class Stumps:
         self._solver: ArticulationSolver = weakref.proxy(solver)  # no cycle of references
         self.missing = 0
         """Number of cuts that were made at a joint because no spare body was left, or the wood could not be split."""
+        self.table = np.zeros((0, 3))
+        """[k, 3] Body of each stump, segment that was cut, and end of the stump [m]. A cut makes a new table."""
         self._compliance = np.ones(len(solver.model.body_mass))
         """[body] Compliance of each joint, relative to that of the model's joint."""
         self._spares = np.flatnonzero(solver.model.is_spare())
@@ -1190,6 +1192,9 @@ class Stumps:
         for body, start, end in self.parts_of(segment):
             self._solver.body_start[body] = start
             self._solver.body_end[body] = end
+        state = self._solver.state
+        used = self._spares[state.stump_of[self._spares] >= 0]
+        self.table = np.column_stack([used, state.stump_of[used], state.stump_end[used].astype(float)])
 
     def _joints_on(self, segment: int) -> list[tuple[int, int]]:
         """Returns the bodies whose joints are at the tip of a segment, each with the segment of which it is a part."""

@@ -108,17 +108,24 @@ def part_of(model: Model, segment: int, start: float, end: float) -> Part:
     )
 
 
+_CLAMPED = 2.0 * 3.0 / 1.875104**4
+"""Compliance of the spring at a clamp with which a rigid rod has the first frequency of an elastic one, relative to
+that of half the rod. w^2 = 3 k / (m L^2) of the rigid rod equals 1.875104^4 E I / (m L^3) of the Euler-Bernoulli beam.
+"""
+
+
 def joint_compliance(model: Model, segment: int, own: float, above: float) -> float:
     """Returns the compliance of a segment's joint relative to the model's, if the segment has the share ``own`` of its
     length, and its parent the share ``above``.
 
     A joint bends for the half of its segment and the half of the parent that meet there
     (:mod:`vinesim.scene.builder`). Each has a compliance of half its length over its flexural rigidity at the joint.
-    Both are taken as the same wood; where they are not, the thicker parent's share is small.
+    Both are taken as the same wood; where they are not, the thicker parent's share is small. The spring of a stump at a
+    clamp bends for the whole stump, which has no other joint.
     """
     parent = int(model.body_parent[segment])
     if parent < 0 or model.body_organ[parent] == int(Organ.BUNCH):
-        return own
+        return _CLAMPED * own if own < 1.0 else 1.0
     length = model.body_length[[segment, parent]].astype(float)
     radius = np.array([model.body_radius[segment, 0], model.body_radius[parent, 1]], float)
     if not (radius > 0.0).all():

@@ -63,6 +63,9 @@ class Snapshot:
     (motion in the wind) of all other trees, which :mod:`vinesim.wind.sway` adds for rendering."""
     wires: SegmentPoses = dataclasses.field(default_factory=SegmentPoses)
     """Poses of displaced segments of wires; all other segments have their rest poses."""
+    stumps: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+    """[k, 3] Stumps that cuts of canes have left: body of the stump, segment that was cut, and distance of the cut from
+    the segment's origin [m]. The stump has the segment's frame."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
