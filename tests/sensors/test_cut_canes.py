@@ -27,7 +27,7 @@ def leafy_segment(model: Model) -> tuple[int, float]:
         base = np.sort(model.leaf_base[model.leaf_body == body, 0])
         number = body - model.tree_first[model.body_tree[body]]
         tied = np.isin(model.body_tree[body], model.body_tree[model.tie_body[model.tie_body >= body]])
-        if base[1] - base[0] > 0.01 and 3 < number < 10 and not tied:
+        if base[1] - base[0] > 0.01 and number > 2 and not tied:
             return body, round(float(base[:2].mean()), 4)
     raise AssertionError("no segment has two leaves apart")
 

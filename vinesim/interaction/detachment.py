@@ -216,7 +216,7 @@ class DetachmentMonitor:
         mouth = frames.compose(self.rigid.link_pose(blade.actor, blade.link), blade.pose)
         far = np.linalg.norm(blade.half)
         apart = body_q[:, :3] - mouth[:3].astype(np.float32)
-        reach = far + model.body_length
+        reach = far + self.plants.body_end
         near = np.flatnonzero(self._wood & ((apart * apart).sum(1) < reach * reach))
         near = near[self.plants.body_end[near] > self.plants.body_start[near]]
         _, _, enter, leave = self._axes_in_mouth(blade, near)
@@ -237,13 +237,14 @@ class DetachmentMonitor:
         bodies = np.array([body])
         start, along, enter, leave = (values[0] for values in self._axes_in_mouth(blade, bodies))
         share = float(np.clip(-start[2] / along[2], enter, leave))
-        radius = float(plants.model.body_radius[plants.stumps.segment_of(body)].mean())
+        segment = plants.stumps.segment_of(body)
+        radius = float(plants.model.body_radius[segment].mean())
         if enter > leave or abs(start[2] + share * along[2]) > radius:
             return None
         first, end = float(plants.body_start[body]), float(plants.body_end[body])
         at = first + share * (end - first)
         is_fresh = (first > 0.0 or plants.state.body_cut[body]) and at - first < SAME_CUT
-        return None if is_fresh or (end < float(plants.model.body_length[body]) and end - at < SAME_CUT) else at
+        return None if is_fresh or (end < float(plants.model.body_length[segment]) and end - at < SAME_CUT) else at
 
     def _cut_in_peduncle(self, blade: Blade, bunch: int) -> tuple[int, float]:
         """Returns the segment of a bunch's peduncle in which a closing blade cuts it, and the place [m] along it: the

@@ -1192,6 +1192,7 @@ class Stumps:
         for body, start, end in self.parts_of(segment):
             self._solver.body_start[body] = start
             self._solver.body_end[body] = end
+        self._solver.buffers.upload(["body_length"] if "body_length" in self._solver.buffers.host else [])
         state = self._solver.state
         used = self._spares[state.stump_of[self._spares] >= 0]
         self.table = np.column_stack([used, state.stump_of[used], state.stump_end[used].astype(float)])

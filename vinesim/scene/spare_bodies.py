@@ -21,6 +21,8 @@ _MASS = 1e-9
 """[kg] Mass of a spare body: nothing, but its joint needs an inertia that can be inverted."""
 _INERTIA = 1e-12
 """[kg m^2] Moments of inertia of a spare body."""
+_LENGTH = 1e-6
+"""[m] Length of a spare body."""
 _BODY_INDICES = ("body_parent", "bunch_body", "bunch_cluster", "tie_body", "leaf_body")
 """Fields that contain indices of bodies."""
 
@@ -51,13 +53,9 @@ def with_spares(model: Model, count: int = SPARES) -> Model:
     spare = np.ones(len(spared.body_mass), bool)
     spare[moved] = False
     owner = np.repeat(np.arange(trees), count)
-    longest = np.zeros(trees, np.float32)
-    wood = model.body_organ == int(Organ.CANE)
-    np.maximum.at(longest, tree[wood], model.body_length[wood])
     spared.body_tree[spare] = owner
     spared.body_organ[spare] = int(Organ.CANE)
-    # nothing is longer than this, whichever segment is cut
-    spared.body_length[spare] = np.where(longest > 0.0, longest, model.body_length.max(initial=1.0))[owner]
+    spared.body_length[spare] = _LENGTH
     spared.body_mass[spare] = _MASS
     spared.body_inertia[spare] = _INERTIA
     spared.terrain = model.terrain
