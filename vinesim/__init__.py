@@ -51,9 +51,9 @@ if TYPE_CHECKING:
     from vinesim.scene.physics_parameters import PhysicsParameters as PhysicsParameters
     from vinesim.scene.plant_import.imported_plant import ImportedPlant as ImportedPlant
     from vinesim.scene.plant_import.imported_plant import import_plant as import_plant
+    from vinesim.scene.spare_bodies import with_spares as with_spares
     from vinesim.scene.spec import Scene as Scene
     from vinesim.scene.spec import load_scene as load_scene
-    from vinesim.scene.spare_bodies import with_spares as with_spares
     from vinesim.scene.state import State as State
     from vinesim.scene.surroundings import Box as Box
     from vinesim.scene.surroundings import Tie as Tie

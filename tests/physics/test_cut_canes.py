@@ -36,7 +36,9 @@ def inertia_of(plants: ArticulationSolver, bodies: list[int]) -> tuple[np.ndarra
     own = np.zeros((len(bodies), 3, 3))
     for axis in range(3):
         own[:, axis, axis] = plants.body_inertia[bodies, axis]
-        own[:, (axis + 1) % 3, (axis + 2) % 3] = own[:, (axis + 2) % 3, (axis + 1) % 3] = plants.body_product[bodies, axis]
+        own[:, (axis + 1) % 3, (axis + 2) % 3] = own[:, (axis + 2) % 3, (axis + 1) % 3] = plants.body_product[
+            bodies, axis
+        ]
     at = pose[:, :3] + np.einsum("kij,kj->ki", axes, plants.body_com[bodies].astype(float)) - pose[0, :3]
     tensor = axes @ own @ axes.swapaxes(1, 2)
     square = (at * at).sum(1)[:, None, None] * np.eye(3) - at[:, :, None] * at[:, None, :]
@@ -44,7 +46,8 @@ def inertia_of(plants: ArticulationSolver, bodies: list[int]) -> tuple[np.ndarra
 
 
 def moving_mass(plants: ArticulationSolver, bodies: slice) -> tuple[float, float]:
-    """Sums over bodies of m (|v| + |w| |c|) and of this times |r| about the world's origin, the scale of errors of their momenta."""
+    """Sums over bodies of m (|v| + |w| |c|), and of this times |r| about the world's origin: the scale of errors of
+    their momenta."""
     rate = np.linalg.norm(plants.state.body_qd[bodies].reshape(-1, 2, 3), axis=2)
     speed = plants.body_mass[bodies] * (rate[:, 0] + rate[:, 1] * np.linalg.norm(plants.body_com[bodies], axis=1))
     return float(speed.sum()), float(speed @ np.linalg.norm(plants.state.body_q[bodies, :3], axis=1))
@@ -66,8 +69,8 @@ def random_cut(plants: ArticulationSolver, tree: int, random: np.random.Generato
 
 
 def cut_at_random(scene: str, count: int, seed: int) -> None:
-    """Cut canes of a scene at random while they swing and hold the laws of each cut. Two cuts and more in one tree; every
-    second tree is fine."""
+    """Cut canes of a scene at random while they swing and hold the laws of each cut. Two cuts and more in one tree;
+    every second tree is fine."""
     model = generate(load_scene(scene))
     random = np.random.default_rng(seed)
     physics = Physics(model)
@@ -280,10 +283,10 @@ def test_a_stump_and_a_piece_can_be_cut_again():
     other.cut(5, 0.05)
     piece = int(other.plants.stumps.table[0, 0])
     assert np.flatnonzero(other.state.body_cut).tolist() == [5, piece], "both parts of a piece that was cut off fall"
-    for physics in (physics, other):
+    for world in (physics, other):
         for _ in range(20):
-            physics.step()
-        total = physics.plants.body_mass[np.arange(12)].sum()
+            world.step()
+        total = world.plants.body_mass[np.arange(12)].sum()
         assert total == pytest.approx(level_cane().body_mass.sum(), rel=1e-6)
 
 
@@ -293,7 +296,9 @@ def test_without_a_spare_body_the_cut_is_at_the_joint_and_says_so(caplog):
     physics.cut(6, 0.05)
     with caplog.at_level(logging.WARNING):
         physics.cut(4, 0.05)
-    assert "cut 50.0 mm along body 4 was made at its joint: the 2 spare bodies of tree 0 are stumps already" in caplog.text
+    assert (
+        "cut 50.0 mm along body 4 was made at its joint: the 2 spare bodies of tree 0 are stumps already" in caplog.text
+    )
     physics.step()
     assert [(d.body, d.segment) for d in physics.detachments] == [(4, -1), (6, 6), (8, 8)]
     assert physics.faults["cuts_moved"] == 1
@@ -340,7 +345,11 @@ def test_ties_before_the_cut_hold_the_stump():
             for _ in range(100):
                 physics.step()
             point = physics.state.body_q[physics.plants.ties.tie_body[tie]].astype(float)
-            away = point[:3] + frames.rotate(point[3:], model.tie_point[tie].astype(float)) - physics.plants.tie_anchor[tie]
+            away = (
+                point[:3]
+                + frames.rotate(point[3:], model.tie_point[tie].astype(float))
+                - physics.plants.tie_anchor[tie]
+            )
             assert np.linalg.norm(away) < 0.05, holder  # wires give
             assert physics.faults["trees_stopped"] == 0
     assert checked == 4
@@ -355,7 +364,15 @@ def test_a_state_with_stumps_can_be_loaded():
         first.cut(*random_cut(first.plants, tree, random))
     second = ArticulationSolver(model, first.state.copy())
     plants = first.plants
-    for name in ("body_mass", "body_com", "body_inertia", "body_drag", "joint_stiffness", "joint_damping", "body_parent"):
+    for name in (
+        "body_mass",
+        "body_com",
+        "body_inertia",
+        "body_drag",
+        "joint_stiffness",
+        "joint_damping",
+        "body_parent",
+    ):
         np.testing.assert_allclose(getattr(second, name), getattr(plants, name), rtol=1e-5, atol=1e-12, err_msg=name)
     for name in ("_parent", "_root", "body_start", "body_end", "core_moving", "tree_moving"):
         np.testing.assert_array_equal(getattr(second, name), getattr(plants, name), err_msg=name)

@@ -211,7 +211,6 @@ class DetachmentMonitor:
     def _bodies_in_mouth(self, blade: Blade) -> np.ndarray:
         """Returns the pieces of wood [k] that a closing blade cuts: their axis passes through its mouth, and the axis
         of a cane also through the plane in which the blades close. Of each branch only the piece nearest the root."""
-        model = self.plants.model
         body_q = self.plants.state.body_q
         mouth = frames.compose(self.rigid.link_pose(blade.actor, blade.link), blade.pose)
         far = np.linalg.norm(blade.half)
@@ -221,8 +220,9 @@ class DetachmentMonitor:
         near = near[self.plants.body_end[near] > self.plants.body_start[near]]
         _, _, enter, leave = self._axes_in_mouth(blade, near)
         caught = near[enter <= leave]
-        caught = caught[[bunch >= 0 or self._place_on_cane(blade, body) is not None
-                         for body, bunch in zip(caught.tolist(), self._bunch_of[caught].tolist(), strict=True)]]
+        canes = caught[self._bunch_of[caught] < 0].tolist()
+        missed = [body for body in canes if self._place_on_cane(blade, body) is None]
+        caught = caught[~np.isin(caught, missed)]
         inside = np.zeros(len(self._wood), bool)
         inside[caught] = True
         return caught[~self._has_marked_ancestor(caught, inside)]
@@ -259,9 +259,9 @@ class DetachmentMonitor:
         return int(segments[best]), float(crossing[best] * model.body_length[segments[best]])
 
     def _axes_in_mouth(self, blade: Blade, bodies: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Returns the axes of the wood of ``bodies`` [k] in the frame of a blade's mouth: starts [k, 3] m and vectors to
-        the ends [k, 3] m, and the shares [k] of these vectors between which the axes are in the mouth; no share is in it if the
-        first is larger than the second."""
+        """Returns the axes of the wood of ``bodies`` [k] in the frame of a blade's mouth: starts [k, 3] m and vectors
+        to the ends [k, 3] m, and the shares [k] of these vectors between which the axes are in the mouth; no share is
+        in it if the first is larger than the second."""
         body_q = self.plants.state.body_q
         mouth = frames.compose(self.rigid.link_pose(blade.actor, blade.link), blade.pose)
         start = frames.rotate(frames.conjugate(mouth[3:]), body_q[bodies, :3] - mouth[:3])
@@ -377,7 +377,7 @@ class DetachmentMonitor:
         return whole, velocity
 
     def cut(self, body: int, cause: str = "command", actor: str = "", at: float | None = None) -> None:
-        """Cut a piece of wood ``at`` [m] from the origin of its body. What is beyond the cut falls, and the stump stays.
+        """Cut a piece of wood ``at`` [m] from the origin of its body. What is beyond the cut falls, the stump stays.
         Call this between steps.
 
         A peduncle is cut in its middle unless ``at`` is given, and its bunch keeps the stalk beyond the cut. A cane

@@ -363,7 +363,9 @@ def _check_stump(record: RetainedRecord, stump: int, segment: int, place: float,
     if not spares <= stump < spares + int(model.tree_spares[record.object]):
         raise MessageError(f"record of tree {record.object} with the stump {stump}, which is no spare body")
     if not first <= segment < spares or model.body_organ[segment] != int(Organ.CANE) or segment not in record.cut:
-        raise MessageError(f"record of tree {record.object} with a stump of body {segment}, which is no cane that was cut")
+        raise MessageError(
+            f"record of tree {record.object} with a stump of body {segment}, which is no cane that was cut"
+        )
     if not 0.0 < place < float(model.body_length[segment]):
         raise MessageError(f"record of tree {record.object} cut {place:.4g} m along body {segment}, beyond its end")
 

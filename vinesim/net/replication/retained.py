@@ -4,8 +4,8 @@ A last-writer-wins map. Merging is a join of a semilattice: equal sets of record
 order and however often the records arrive. Of two records of one object the one with the greater claim is kept
 (:func:`authority.wins`). An author therefore never publishes two different records with the same claim. Cuts
 accumulate: the record that is kept also takes over the cuts and stumps of the other one. If two records name the same
-body as stumps of different cuts, the lower segment and the lower place are kept. The server keeps one map for each world,
-and every client keeps a map of the records that it has received.
+body as stumps of different cuts, the lower segment and the lower place are kept. The server keeps one map for each
+world, and every client keeps a map of the records that it has received.
 Source: M. Shapiro et al., Conflict-free Replicated Data Types, 2011.
 """
 

@@ -296,7 +296,9 @@ def _tree_centres(model: Model) -> np.ndarray:
 def _lever_arms(model: Model) -> np.ndarray:
     """Returns the largest distance from the joint of each body to the end of a body that it carries [body] m."""
     reach = model.body_length.astype(float).copy()
-    reach[model.is_spare()] = model.body_length[model.body_organ == int(Organ.CANE)].max(initial=0.0)  # if it is a stump
+    reach[model.is_spare()] = model.body_length[model.body_organ == int(Organ.CANE)].max(
+        initial=0.0
+    )  # if it is a stump
     for body in range(len(reach) - 1, -1, -1):
         parent = model.body_parent[body]
         if parent >= 0:

@@ -125,8 +125,8 @@ class Primitives:
         self._stump_trees = np.zeros(0, np.int64)
         """Trees [k] whose stumps the last change of rigid bodies has changed."""
         self.stump_keys: list[tuple[int, int, float, float, float]] = []
-        """Each place and carrier that the primitives in :attr:`stump_rows` have had: primitive, carrier, and first point
-        in the carrier's frame [m]. Pages know primitives by them."""
+        """Each carrier and place that the primitives in :attr:`stump_rows` have had: primitive, carrier, and first
+        point in the carrier's frame [m]. Pages know primitives by them."""
         self._cuts = np.zeros((0, 3))
         """``Snapshot.stumps`` as drawn."""
         self._whole: dict[int, dict[str, np.ndarray]] = {}
@@ -363,8 +363,8 @@ class Primitives:
             self._know([*kept])
 
     def _draw_cut_canes(self, cuts: np.ndarray) -> np.ndarray:
-        """Draw canes as cut by ``cuts`` [k, 3] (``Snapshot.stumps``): the wood of each stump and of the part beyond, and
-        the leaves on the stump. Returns the trees [k] that have changed."""
+        """Draw canes as cut by ``cuts`` [k, 3] (``Snapshot.stumps``): the wood of each stump and of the part beyond,
+        and the leaves on the stump. Returns the trees [k] that have changed."""
         trees = self.model.body_tree[np.concatenate([self._cuts, cuts])[:, 0].astype(int)]
         self._cuts = cuts.copy()
         for row, columns in self._whole.items():
