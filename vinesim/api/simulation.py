@@ -321,8 +321,10 @@ class Simulation:
         """
         body = self._body(body)
         if at is not None:
-            start, end = (float(ends[body]) for ends in (self.physics.plants.body_start, self.physics.plants.body_end))
-            if self.model.body_organ[body] not in (int(Organ.CANE), int(Organ.PEDUNCLE)) or end <= start:
+            plants = self.physics.plants
+            start, end = float(plants.body_start[body]), float(plants.body_end[body])
+            organ = self.model.body_organ[plants.stumps.segment_of(body)]
+            if organ not in (int(Organ.CANE), int(Organ.PEDUNCLE)) or end <= start:
                 raise UsageError(f"at {at!r}: body {body} has no wood; leave out at")
             if not (is_number(at) and start <= at <= end):
                 raise UsageError(f"at {at!r}: body {body} has wood from {start:.4g} to {end:.4g} m; give a place in it")

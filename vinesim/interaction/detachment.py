@@ -92,7 +92,7 @@ class DetachmentMonitor:
         order = np.argsort(trees, kind="stable")
         self._bunches = order.astype(np.int32)
         self._first = np.searchsorted(trees[order], np.arange(len(model.tree_first) + 1))
-        self._wood = np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE))
+        self._wood = np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE)) | model.is_spare()
         self._awake: np.ndarray | None = None
         self._awake_bunches = np.zeros(len(order), np.int32)
         self._longest = np.zeros(1, np.int32)

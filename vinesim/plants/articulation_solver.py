@@ -444,7 +444,7 @@ class ArticulationSolver:
         tree = int(model.body_tree[body])
         if body - model.tree_first[tree] >= model.tree_core[tree]:
             raise ValueError(f"body {body} of tree {tree} is a berry cluster; cut off its bunch")
-        if model.is_spare()[body] and state.stump_of[body] < 0:
+        if self.body_end[body] <= self.body_start[body]:
             raise ValueError(f"body {body} of tree {tree} is a spare without wood")
         spare = -1
         if at != 0.0:

@@ -1,9 +1,9 @@
 """Spare bodies: the bodies of stumps that cuts may leave ([why](../decisions/cutting.md)).
 
 A segment of wood is one body. A cut within a segment makes two bodies of it, but the number of bodies of a model never
-changes. So a tree has a few bodies without wood, between its core and its berry clusters. Until a cut makes a spare
-body a stump, it stands at the tree's root frame, carries no load, and no other body feels it. While the berry clusters
-are locked, unused spares are not simulated.
+changes. So a tree has a few bodies without wood, of organ NOTHING, between its core and its berry clusters. Until a
+cut makes a spare body a stump, it stands at the tree's root frame, carries no load, and no other body feels it. While
+the berry clusters are locked, unused spares are not simulated.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def with_spares(model: Model, count: int = SPARES) -> Model:
     spare[moved] = False
     owner = np.repeat(np.arange(trees), count)
     spared.body_tree[spare] = owner
-    spared.body_organ[spare] = int(Organ.CANE)
+    spared.body_organ[spare] = int(Organ.NOTHING)
     spared.body_length[spare] = _LENGTH
     spared.body_mass[spare] = _MASS
     spared.body_inertia[spare] = _INERTIA

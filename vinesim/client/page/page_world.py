@@ -547,7 +547,7 @@ def _within_reach(model: Model) -> dict[str, np.ndarray]:
     They contain bodies of wood with their lengths [m], and for each bunch its body, length and radius [m], and the last
     segment of its peduncle.
     """
-    wood = np.flatnonzero(np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE)) & ~model.is_spare())
+    wood = np.flatnonzero(np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE)))
     stalk = model.body_parent[model.bunch_body]
     return {
         "wood": wood.astype(np.uint32),

@@ -38,7 +38,8 @@ def cane_batch(model: Model) -> Batch:
     bodies = np.flatnonzero((model.body_organ != int(Organ.BUNCH)) & (model.body_length > 0.0))
     rng = np.random.default_rng(5)
     seed = rng.uniform(size=len(model.tree_first))
-    organ = model.body_organ[bodies]
+    is_spare = model.is_spare()[bodies]  # a spare is drawn when a cut has made it a stump
+    organ = np.where(is_spare, int(Organ.CANE), model.body_organ[bodies])
     tree = model.body_tree[bodies]
     index = tree.copy()
     bunch_of = model.bunch_of_body()[bodies]
@@ -49,7 +50,6 @@ def cane_batch(model: Model) -> Batch:
     wood = model.look.palette.wood
     tint = (1.0 - green) * np.array(wood.cane) * (0.7 + 0.6 * seed[tree, None]) + green * np.array(wood.stem)
     material = np.where(green[:, 0] > 0.5, int(materials.STEM), int(materials.CANE))
-    is_spare = model.is_spare()[bodies]  # a spare is drawn when a cut has made it a stump
     length = np.where(is_spare, UNSEEN, model.body_length[bodies])
     radius = np.where(is_spare[:, None], UNSEEN, model.body_radius[bodies])
     zero = np.zeros(len(bodies))

@@ -392,7 +392,8 @@ class Primitives:
                     for name, at in (("local_a", start), ("local_b", end)):
                         drawn[name][own] = first + (at / edges[-1]) * (last - first)
                 drawn["carrier"][here[(start <= base[here]) & (base[here] < end)]] = body
-        changed = np.flatnonzero(np.any([(drawn[n] != whole[n]).reshape(len(rows), -1).any(1) for n in drawn], axis=0))
+        columns = [(drawn[name] != whole[name]).T.reshape(-1, len(rows)) for name in drawn if len(rows)]
+        changed = np.flatnonzero(np.concatenate(columns).any(0)) if columns else rows
         for k in changed.tolist():
             row = int(rows[k])
             self._whole[row] = {name: values[k : k + 1].copy() for name, values in whole.items()}
