@@ -210,7 +210,12 @@ def _record(model: Model, claim: Claim, now: float, chance: random.Random) -> Re
     cut = tuple(sorted(chance.sample(bodies, chance.randint(0, min(3, len(bodies))))))
     other = tree if chance.random() < 0.8 else chance.randrange(len(model.tree_first))
     state = chance.choice((b"", _trees_message(model, other, claim, now, chance), chance.randbytes(30)))
-    return msgspec.structs.replace(record, cut=cut, trees=state)
+    spares = range(first + int(model.tree_core[tree]) - 3, first + int(model.tree_core[tree]) + 1)
+    stumps = tuple(
+        (chance.choice(spares), chance.choice((*cut, first)), chance.randint(1, 1000))
+        for _ in range(chance.randint(0, 3))
+    )
+    return msgspec.structs.replace(record, cut=cut, trees=state, stumps=stumps)
 
 
 _PARENTS = (

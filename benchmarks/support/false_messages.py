@@ -290,6 +290,17 @@ def _records(draw: Draw, model: Model) -> FalseMessage:
         first = int(model.tree_first[tree])
         size = int(model.tree_size[tree])
         cut = sorted(draw(st.sets(st.one_of(st.integers(first, first + size), st.integers(0, 1 << 20)), max_size=3)))
+        spare = first + int(model.tree_core[tree]) - 2
+        stumps = draw(
+            st.lists(
+                st.tuples(
+                    st.integers(spare - 1, spare + 2),
+                    st.one_of(st.sampled_from(cut or [first]), st.integers(first, first + size)),
+                    st.integers(1, 1000),
+                ),
+                max_size=3,
+            )
+        )
         state = draw(st.one_of(st.just(b""), st.binary(max_size=30), _composite(_about_trees, model)))
         pose = (*_vectors(draw, FAR, 3).tolist(), *_quaternions(draw, 1)[0].tolist())
         records.append(
@@ -303,6 +314,7 @@ def _records(draw: Draw, model: Model) -> FalseMessage:
                 tuple(cut) if draw(st.booleans()) else (),
                 state.payload if isinstance(state, FalseMessage) else state,
                 draw(st.booleans()),
+                stumps=tuple(stumps),
             )
         )
     payload = encode_records(records)

@@ -79,6 +79,25 @@ def test_a_record_that_may_be_true_is_accepted(truth: RetainedRecord) -> None:
     check_record(truth, vineyard(), COUNTS)
 
 
+def test_a_stump_must_be_a_spare_body_of_a_cane_that_was_cut() -> None:
+    model = generate(load_scene("demo"))
+    tree = 5
+    first = int(model.tree_first[tree])
+    spare = first + int(model.tree_core[tree]) - 1
+    check_record(RetainedRecord(tree, 1, 1, "ada", cut=(first + 3,), stumps=((spare, first + 3, 250),)), model, COUNTS)
+    for cut, stump, why in (
+        (first + 3, (first + 4, first + 3, 250), "no spare body"),
+        (first + 3, (spare + 1, first + 3, 250), "no spare body"),
+        (first + 3, (spare, first + 2, 250), "no cane that was cut"),
+        (spare, (spare, spare, 250), "no cane that was cut"),
+        (first + 3, (spare, first + 3, 9999), "beyond its end"),
+    ):
+        with pytest.raises(MessageError, match=why):
+            check_record(RetainedRecord(tree, 1, 1, "ada", cut=(cut,), stumps=(stump,)), model, COUNTS)
+    with pytest.raises(MessageError, match="it is none"):
+        check_record(record(object=BOX, stumps=((spare, first + 3, 250),)), model, COUNTS)
+
+
 def test_a_berry_cluster_cannot_be_cut_off_alone() -> None:
     model = generate(load_scene("demo"))
     tree = int(np.flatnonzero(model.tree_size > model.tree_core)[0])

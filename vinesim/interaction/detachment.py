@@ -429,8 +429,8 @@ class DetachmentMonitor:
             self.rigid.replace_bunch(bunch, with_settled_stalk(model, bunch, self.rigid.free_bunch(bunch), segment, at))
 
     def apply_remote_cut(self, body: int) -> None:
-        """Cut off a body that another client has cut off."""
-        if not self.plants.state.body_cut[body]:
+        """Cut off a body that another client has cut off. Nothing happens to a spare body, which has no wood."""
+        if not self.plants.state.body_cut[body] and self.plants.body_end[body] > self.plants.body_start[body]:
             tree = int(self.plants.model.body_tree[body])
             self.plants.wake(tree)
             self.plants.cut(body)

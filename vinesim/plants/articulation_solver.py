@@ -1030,9 +1030,13 @@ class Stumps:
         segment = self.segment_of(body)
         spares = self._spares_of(body)
         free = spares[solver.state.stump_of[spares] < 0]
-        if len(free) and not (why := self._obstacle(segment, body, at)):
+        tree = f"tree {model.body_tree[body]}"
+        if len(spares) == 0:
+            why = f"{tree} has no spare body for a stump; vinesim.with_spares adds them"
+        elif len(free) == 0:
+            why = f"the {len(spares)} spare bodies of {tree} are stumps already"
+        elif not (why := self._obstacle(segment, body, at)):
             return int(free[0])
-        why = why if len(free) else f"the {len(spares)} spare bodies of tree {model.body_tree[body]} are stumps already"
         self.missing += 1
         _log.warning("cut %.1f mm along body %d was made at its joint: %s", 1e3 * at, body, why)
         return -1

@@ -66,7 +66,7 @@ class FaultGuard:
         bodies = plants.bodies_of(stopped)
         length = np.square(state.joint_q[bodies], dtype=float).sum(-1)
         unsound = bodies[~(abs(length - 1.0) < 0.01)]  # an invalid pose was written from outside: no valid one is left
-        state.joint_q[unsound] = plants.model.joint_settled[unsound]
+        state.joint_q[unsound] = plants.joint_settled[unsound]
         cut = bodies[state.body_cut[bodies]]
         state.joint_xd[cut] = 0.0
         lost = cut[~np.isfinite(state.joint_x[cut]).all(-1)]

@@ -298,7 +298,7 @@ class ObjectSync:
         state = self.physics.state
         first = int(self.physics.model.tree_first[update.tree])
         for body, x, xd in zip((first + update.root).tolist(), update.root_x, update.root_xd, strict=True):
-            if plants.body_end[body] == 0.0:  # the record that makes it a stump has not arrived yet
+            if plants.body_end[body] == 0.0:  # a spare: the record that makes it a stump has not arrived yet
                 continue
             if not state.body_cut[body]:
                 self.apply_remote_cut(body)
