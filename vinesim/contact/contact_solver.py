@@ -284,7 +284,7 @@ class ContactSolver:
         last = first[-1]
         for (body, _, _), capsule in zip(parts[:-1], first[:-1], strict=True):
             if shapes.level[capsule] == HIDDEN:
-                tied = bool(np.isin(body, plants.ties.tie_body))
+                tied = bool(plants.ties.are_tied(np.array([body]))[0])
                 self.detection.pass_ties(last, capsule, body, tied=tied)
         self.detection.divide(
             last, [(capsule, start, end) for capsule, (_, start, end) in zip(first, parts, strict=True)]

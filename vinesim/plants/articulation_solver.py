@@ -510,7 +510,7 @@ class ArticulationSolver:
         the held ones. ``bodies``: all bodies of some trees."""
         root = self._root[bodies]
         is_cut = self.state.body_cut[bodies]
-        tied = np.isin(bodies, self.ties.tied_bodies)
+        tied = self.ties.are_tied(bodies)
         self._falls[bodies] = (root >= 0) & ~np.isin(root, root[tied])
         if is_cut.any():
             damping = turning_damping(self.model, bodies, root, tied, self._gravity)
@@ -1203,8 +1203,10 @@ class Stumps:
 
     def _joints_on(self, segment: int) -> list[tuple[int, int]]:
         """Returns the bodies whose joints are at the tip of a segment, each with the segment of which it is a part."""
-        grown = np.flatnonzero(self._solver.model.body_parent == segment).tolist()
-        return [(self.parts_of(child)[0][0], child) for child in grown]
+        model = self._solver.model
+        here = model.bodies_of(int(model.body_tree[segment]))
+        grown = here.start + np.flatnonzero(model.body_parent[here] == segment)
+        return [(self.parts_of(child)[0][0], child) for child in grown.tolist()]
 
     def _adjust_joint(self, body: int, segment: int, *, turns: bool) -> None:
         """Give the joint of ``body``, the first part of a segment, the spring of the wood that meets there. ``turns``:
@@ -1448,8 +1450,9 @@ class KernelLaunches:
         return places
 
     def set_branching(self, parent: np.ndarray) -> None:
-        """Change the parents [body] of bodies in the kernels that must know where a tree branches."""
-        self._arrays["body_branches"].assign(self._branching(parent))
+        """Change the parents [body] of bodies in the kernels that must know where a tree branches: those of a GPU."""
+        if self.buffers.has_copies:
+            self._arrays["body_branches"].assign(self._branching(parent))
 
     def upload_changed(self) -> None:
         """Copy the model's rows (parents, masses, springs) to the device, if :attr:`changed`."""

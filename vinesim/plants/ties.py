@@ -77,10 +77,9 @@ class TieTable:
         """Bodies that have ties of :meth:`add`."""
         return list(self._slot_of)
 
-    @property
-    def tied_bodies(self) -> np.ndarray:
-        """Bodies with ties [k]."""
-        return np.append(np.unique(self.tie_body), np.array(self.held_bodies, np.int32))
+    def are_tied(self, bodies: np.ndarray) -> np.ndarray:
+        """Returns whether each of the ``bodies`` [k] has ties."""
+        return self.span[bodies, 1] > self.span[bodies, 0]
 
     def number_on_body(self, ties: np.ndarray) -> np.ndarray:
         """Returns the number [k] of each of the model's ``ties`` [k] among those of its body, from 0."""
