@@ -132,8 +132,8 @@ def test_reading_stops_at_a_flipped_bit_with_one_line(tmp_path, caplog):
         (b"vsfacts\x01" + journal_module._packed(b"nonsense"), "its world is unknown"),
         (
             b"vsfacts\x01"
-            + journal_module._packed(journal_module._encoder.encode(journal_module._Header("w", "s", "d", 9))),
-            "protocol version 9",
+            + journal_module._packed(journal_module._encoder.encode(journal_module._Header("w", "s", "d", 99))),
+            "protocol version 99",
         ),
     ],
 )

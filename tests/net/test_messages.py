@@ -228,8 +228,8 @@ def test_truncated_messages_are_refused(cut):
 
 def test_errors_name_other_versions_kinds_and_programs():
     payload = encode_robot(robot(np.random.default_rng(0)))
-    with pytest.raises(WrongVersion, match=rf"version 9.*speaks {PROTOCOL}\b"):
-        decode_robot(payload[:2] + b"\x09" + payload[3:], "tiago")
+    with pytest.raises(WrongVersion, match=rf"version {PROTOCOL + 1}.*speaks {PROTOCOL}\b"):
+        decode_robot(payload[:2] + bytes((PROTOCOL + 1,)) + payload[3:], "tiago")
     with pytest.raises(MessageError, match="not from vinesim"):
         decode_robot(b"GET / HTTP/1.1", "tiago")
     with pytest.raises(MessageError, match="kind 1 where trees"):

@@ -350,7 +350,7 @@ def test_invalid_records_are_dropped_counted_and_logged_once(caplog):
         publisher = ada.publisher("fact/0/0/ada", reliable=True)
         nowhere = ada.publisher("fact/0/ada", reliable=True)
         wait(lambda: publisher.matching and nowhere.matching, "the server's subscription")
-        for payload in (b"", b"junk", good[:-2], b"VS\x09\x04" + good[4:], bytes(MAX_MESSAGE + 1)):
+        for payload in (b"", b"junk", good[:-2], good[:2] + bytes((PROTOCOL + 1,)) + good[3:], bytes(MAX_MESSAGE + 1)):
             publisher.put(payload)
         nowhere.put(good)
         publisher.put(encode_records([box(author="bob")]))
