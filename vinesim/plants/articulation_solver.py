@@ -41,6 +41,7 @@ from vinesim.kernels.plants.energy_budget import (
     keep_budget,
 )
 from vinesim.kernels.plants.first_mode import MAX_SUBSTEPS, begin_substep, substeps_for
+from vinesim.kernels.plants.fast_motion import move_fast_trees
 from vinesim.kernels.plants.floating_components import correct_floating_momentum
 from vinesim.kernels.plants.impulse_response import apply_wrenches, impulse_response
 from vinesim.kernels.plants.integration import integrate
@@ -211,6 +212,7 @@ class ArticulationSolver:
         self._fastest = np.zeros(1, np.float32)
         self.tree_substeps = np.ones(trees, np.int32)
         """[tree] Number of substeps into which the step of each awake tree is divided while the tree has no contact."""
+        self._moved = np.zeros(trees, np.bool_)
         self.tree_budget = np.zeros(trees, np.int32)
         """[tree] How closely the energy of each awake tree is watched: see
         :mod:`vinesim.kernels.plants.energy_budget`."""
@@ -311,7 +313,7 @@ class ArticulationSolver:
                 "fastest": self._fastest,
             },
             wp.vec2i: {"tie_span": ties.span, "groups": self._groups},
-            wp.bool: {"tree_awake": state.tree_awake, "body_falls": self._falls},
+            wp.bool: {"tree_awake": state.tree_awake, "tree_moved": self._moved, "body_falls": self._falls},
             wp.vec3: {
                 "body_offset": self._offset,
                 "body_com": self.body_com,
@@ -971,6 +973,7 @@ TREE_INPUTS = (
     "tree_steps",
     "tree_rate",
     "tree_awake",
+    "tree_moved",
     "tree_budget",
     "tree_air",
     "root_turn",
@@ -985,8 +988,8 @@ ties."""
 TREE_RESULTS = ("tree_euler_steps", "phi_used", "tree_rate")
 """Arrays with one element for each tree that the kernels of a step write."""
 SCRATCH = {
-    wp.vec3: ("lever", "tension", "Du"),
-    wp.quat: ("axes",),
+    wp.vec3: ("lever", "tension", "Du", "start_joint_qd", "coarse_joint_qd", "part_joint_damping"),
+    wp.quat: ("axes", "start_joint_q", "coarse_joint_q"),
     wp.mat33: ("J", "H", "M", "D", "DJ", "DH", "root_inverse_mass"),
     wp.transform: ("after_q",),
     wp.spatial_vector: (
@@ -1258,8 +1261,9 @@ class KernelLaunches:
             threads=1,
         )
         predict_divided = self._predict(parameters, _DIVIDED, "divided")
-        whole = self._integrate(parameters, _WHOLE, "stepping", _FLOATING, "floating")
-        divided = self._integrate(parameters, _DIVIDED, "divided", _DIVIDED_FLOATING, "divided_floating")
+        fast = [self._move_fast_trees(parameters)] if self._max_substeps > 1 else []
+        whole = self._integrate(parameters, _WHOLE, "stepping", _FLOATING, "floating", fast)
+        divided = self._integrate(parameters, _DIVIDED, "divided", _DIVIDED_FLOATING, "divided_floating", [])
         return Step(
             self.graph(predict),
             {which: self.graph(*launches) for which, launches in whole.items()},
@@ -1312,11 +1316,46 @@ class KernelLaunches:
             self.fill(structs.Prediction),
         )
 
+    def _move_fast_trees(self, parameters: Any) -> KernelLaunch:
+        """Returns the launch that moves fast trees, before the integration of whole steps."""
+        fill = self.fill
+        s = structs
+        device = self.buffers.device
+        scratch = {
+            name: wp.empty_like(self._arrays[name], device=device)
+            for name in ("tie_damping", "tie_anchor", "root_turn")
+        }
+        own = {"joint_damping": "part_joint_damping"}
+        model, forces = fill(s.ArticulationModel, **own), fill(s.AppliedForces)
+        for name, array in scratch.items():
+            setattr(model if name == "tie_damping" else forces, name, array)
+        return self.launch(
+            move_fast_trees,
+            parameters,
+            fill(s.ArticulationModel),
+            self.count(_WHOLE),
+            "stepping",
+            "tree_awake",
+            "tree_euler_steps",
+            fill(s.AppliedForces),
+            fill(s.FastScratch),
+            model,
+            forces,
+            "tree_moved",
+            "phi_used",
+            fill(s.JointState),
+            fill(s.BodyState),
+            fill(s.Factors),
+            fill(s.Scratch),
+            fill(s.Prediction),
+        )
+
     def _integrate(
-        self, parameters: Any, count: int, trees: str, root_count: int, roots: str
+        self, parameters: Any, count: int, trees: str, root_count: int, roots: str, first: list[KernelLaunch]
     ) -> dict[tuple[bool, bool], list[KernelLaunch]]:
         """Returns the launches of an integration for each combination of two conditions, which are the key: whether
-        energy budgets are kept, and whether there are floating roots.
+        energy budgets are kept, and whether there are floating roots. ``first``: launches that come before the joints
+        are moved.
         """
         fill = self.fill
         s = structs
@@ -1346,6 +1385,7 @@ class KernelLaunches:
             "tree_awake",
             "phi_used",
             "tree_steps",
+            "tree_moved",
             joints,
             prediction,
             "tree_rate",
@@ -1375,10 +1415,10 @@ class KernelLaunches:
         stepping = (self.count(_STEPPING), "stepping")
         last = [] if self.buffers.has_copies else [self.launch(find_fastest, *stepping, "tree_rate", "fastest")]
         return {
-            (False, False): [move, *last],
-            (False, True): [move, correct, *last],
-            (True, False): [begin, move, keep, *last],
-            (True, True): [begin, move, keep, correct, *last],
+            (False, False): [*first, move, *last],
+            (False, True): [*first, move, correct, *last],
+            (True, False): [begin, *first, move, keep, *last],
+            (True, True): [begin, *first, move, keep, correct, *last],
         }
 
     def _correct_momentum(self, parameters: Any, count: int, roots: str) -> KernelLaunch:

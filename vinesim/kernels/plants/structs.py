@@ -130,6 +130,17 @@ class Prediction:
 
 
 @wp.struct
+class FastScratch:
+    """Joints of fast trees at the start of the step, and after the step as a whole; see
+    :mod:`vinesim.kernels.plants.fast_motion`."""
+
+    start_joint_q: wp.array(dtype=wp.quat)  # [body]
+    start_joint_qd: wp.array(dtype=wp.vec3)  # [body] rad/s
+    coarse_joint_q: wp.array(dtype=wp.quat)  # [body]
+    coarse_joint_qd: wp.array(dtype=wp.vec3)  # [body] rad/s
+
+
+@wp.struct
 class EnergyBudget:
     """Largest energy that each tree may have, and its bookkeeping. Arrays are [tree] unless said otherwise; see
     :mod:`vinesim.kernels.plants.energy_budget`."""

@@ -1,0 +1,260 @@
+"""Fast motion: a step of second order for trees whose bodies turn fast.
+
+The solve of a step is linear about the start of the step. Gyroscopic and centrifugal terms and the directions of
+levers are those of its start, so that the step errs by a share of about dt w per turn in a body's rate w. Above
+``fast_rate`` a drag and backward Euler keep the step stable, and remove energy at first order in dt. A cane of 0.65 m
+with a bunch of 0.4 kg that is let go level loses a tenth of its kinetic energy in a second.
+
+All these errors are smooth in dt. So a fast tree takes the step twice, once as a whole and once as two halves, both
+with backward Euler and the full damping of its joints, and the results are extrapolated to dt = 0 (Richardson; Lawson
+and Morris, The extrapolation of first order methods for parabolic partial differential equations, 1978):
+
+    v = 2 v_halves - v_whole
+
+and the same for rotations. The result is of second order, also for the damping of joints and ties. Extrapolated
+backward Euler is L-stable: modes that the step does not resolve are damped as with backward Euler.
+
+A tree takes such a step if one of its bodies turns faster than :data:`FAST_SPIN` at the start of the step, or while
+:mod:`vinesim.kernels.plants.integration` demands backward Euler after fast motion. It does not while contacts press on
+it (their impulses belong to the prediction of the whole step), with a cut-off part, if its step is divided into
+substeps, or near ``max_rate``, where rates are limited.
+"""
+
+import warp as wp
+
+from vinesim.kernels.plants.kinematics import max_joint_rate
+from vinesim.kernels.plants.prediction import predict_tree
+from vinesim.kernels.plants.spatial import exponential
+from vinesim.kernels.plants.structs import (
+    AppliedForces,
+    ArticulationModel,
+    BodyState,
+    Factors,
+    FastScratch,
+    JointState,
+    Prediction,
+    Scratch,
+    SolverParameters,
+    substep_parameters,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+FAST_SPIN = wp.constant(2.0)
+"""[rad/s] A body that turns faster makes its tree fast. MEASURED: docs/decisions/integrator.md"""
+
+MAX_SHARE = wp.constant(0.5)
+"""Share of ``max_rate`` above which a joint is too fast for extrapolation. TUNED"""
+
+MAX_PARTS = wp.constant(8)
+"""Largest number of parts of a step. TUNED"""
+
+NO_DRAG = wp.constant(1.0e6)
+"""[rad/s] Rate above which a drag slows the bodies of a fast tree: never."""
+
+MAX_CHANGE = wp.constant(0.1)
+"""Largest difference of rates between halves and whole step, as a share of the largest rate, that is extrapolated.
+
+With a larger one the result of the halves counts, which is of first order and damped. TUNED
+"""
+
+
+@wp.func
+def is_fast(
+    p: SolverParameters,
+    model: ArticulationModel,
+    body_wrench: wp.array(dtype=wp.spatial_vector),
+    bodies: BodyState,
+    joints: JointState,
+    tree: int,
+    euler_steps: int,
+):
+    """Returns whether a tree takes a step of this module; see there. ``bodies``: motion at the start of the step."""
+    first = model.tree_first[tree]
+    size = model.tree_moving[tree]
+    spin = float(0.0)
+    for k in range(first, first + size * model.pitch, model.pitch):
+        spin = wp.max(spin, wp.length_sq(wp.spatial_bottom(bodies.body_qd[k])))
+    if not spin > FAST_SPIN * FAST_SPIN and euler_steps <= p.contact_steps:
+        return False
+    for k in range(first, first + size * model.pitch, model.pitch):
+        wrench = body_wrench[k]
+        if model.body_root[k] >= 0 or wp.dot(wrench, wrench) > 0.0:
+            return False
+    return max_joint_rate(joints.joint_qd, first, size, model.pitch) < MAX_SHARE * p.max_rate
+
+
+@wp.func
+def solve_part(
+    p: SolverParameters,
+    parts: int,
+    elapsed: float,
+    model: ArticulationModel,
+    forces: AppliedForces,
+    tree: int,
+    part_model: ArticulationModel,
+    part_forces: AppliedForces,
+    joints_out: JointState,
+    bodies_out: BodyState,
+    factors_out: Factors,
+    solve_out: Scratch,
+    prediction_out: Prediction,
+):
+    """Move the joints of a tree over one of ``parts`` equal parts of the step, with backward Euler.
+
+    elapsed: [s] time between the start of the step and that of the part. part_model, part_forces: like ``model`` and
+    ``forces``, but their dampings, anchors and root turns are scratch. The dampings get on top what backward Euler
+    itself adds, because a prediction subtracts it. Anchors and turns get their values at the start of the part.
+    """
+    divided = substep_parameters(p, parts)
+    divided.fast_rate = NO_DRAG
+    first = model.tree_first[tree]
+    end = first + model.tree_moving[tree] * model.pitch
+    part_forces.root_turn[tree] = forces.root_turn[tree] + elapsed * forces.root_turn_rate[tree]
+    for k in range(first, end, model.pitch):
+        part_model.joint_damping[k] = model.joint_damping[k] + divided.dt * model.joint_stiffness[k]
+        ties = model.tie_span[k]
+        for t in range(ties[0], ties[1]):
+            part_model.tie_damping[t] = model.tie_damping[t] + divided.dt * model.tie_stiffness[t]
+            part_forces.tie_anchor[t] = forces.tie_anchor[t] + elapsed * forces.tie_anchor_velocity[t]
+    predict_tree(
+        divided,
+        part_model,
+        part_forces,
+        joints_out,
+        tree,
+        1.0,
+        bodies_out,
+        factors_out,
+        solve_out,
+        prediction_out,
+    )
+    for k in range(first, end, model.pitch):
+        rate = prediction_out.joint_qd_free[k]
+        joints_out.joint_qd[k] = rate
+        joints_out.joint_q[k] = wp.normalize(exponential(divided.dt * rate) * joints_out.joint_q[k])
+
+
+@wp.func
+def rotation_vector(q: wp.quat):
+    """Returns the rotation vector [rad] of a unit quaternion, the shorter way."""
+    v = wp.vec3(q[0], q[1], q[2])
+    sine = wp.length(v)
+    angle = 2.0 * wp.atan2(sine, wp.abs(q[3]))
+    scale = wp.where(sine > 1.0e-6, angle / wp.max(sine, 1.0e-6), 2.0)
+    return wp.where(q[3] < 0.0, -scale, scale) * v
+
+
+@wp.func
+def relative_change(model: ArticulationModel, tree: int, fast: FastScratch, joints: JointState):
+    """Returns the largest difference of joint rates between the coarser and the finer result of a step, as a share of
+    the largest rate; NaN if a rate is NaN."""
+    first = model.tree_first[tree]
+    change = float(0.0)
+    fastest = float(1.0e-20)
+    for k in range(first, first + model.tree_moving[tree] * model.pitch, model.pitch):
+        rate = joints.joint_qd[k]
+        change = wp.max(change, wp.length_sq(rate - fast.coarse_joint_qd[k]))
+        fastest = wp.max(fastest, wp.length_sq(rate))
+    return wp.sqrt(change / fastest)
+
+
+@wp.func
+def extrapolate(model: ArticulationModel, tree: int, fast: FastScratch, joints_out: JointState):
+    """Extrapolate the joints of a tree from two results, one with twice as many parts as the other, to dt = 0."""
+    first = model.tree_first[tree]
+    end = first + model.tree_moving[tree] * model.pitch
+    for k in range(first, end, model.pitch):
+        q = joints_out.joint_q[k]
+        further = rotation_vector(q * wp.quat_inverse(fast.coarse_joint_q[k]))
+        joints_out.joint_q[k] = wp.normalize(exponential(further) * q)
+        joints_out.joint_qd[k] = 2.0 * joints_out.joint_qd[k] - fast.coarse_joint_qd[k]
+
+
+@wp.kernel
+def move_fast_trees(
+    # model
+    p: SolverParameters,
+    model: ArticulationModel,
+    # in
+    count: wp.array(dtype=wp.int32),
+    trees: wp.array(dtype=wp.int32),
+    tree_awake: wp.array(dtype=wp.bool),
+    tree_euler_steps: wp.array(dtype=wp.int32),
+    forces: AppliedForces,
+    # out
+    fast: FastScratch,
+    part_model: ArticulationModel,
+    part_forces: AppliedForces,
+    tree_moved_out: wp.array(dtype=wp.bool),
+    tree_phi_out: wp.array(dtype=float),
+    joints_out: JointState,
+    bodies_out: BodyState,
+    factors_out: Factors,
+    solve_out: Scratch,
+    prediction_out: Prediction,
+):
+    """One thread per tree, before the integration of whole steps. Move the joints of fast trees to the end of the step.
+
+    trees: [thread] index of the tree. tree_euler_steps: [tree] number of steps still to be taken with phi = 1. fast,
+    part_model, part_forces, factors_out, solve_out: scratch; see :func:`solve_part`. tree_moved_out: [tree] whether the
+    tree was moved. tree_phi_out: [tree] 1 for a tree that was moved. joints_out: [body] of a tree that was moved, at
+    the end of the step. bodies_out: motion at the start of the step; of a tree that was moved, at the start of the
+    second half. prediction_out: accelerations over the second half, joint rates at the end.
+    """
+    if wp.tid() >= count[0]:
+        return
+    tree = trees[wp.tid()]
+    tree_moved_out[tree] = False
+    if not tree_awake[tree]:
+        return
+    if not is_fast(p, model, forces.body_wrench, bodies_out, joints_out, tree, tree_euler_steps[tree]):
+        return
+    first = model.tree_first[tree]
+    size = model.tree_moving[tree]
+    end = first + size * model.pitch
+    for k in range(first, end, model.pitch):
+        fast.start_joint_q[k] = joints_out.joint_q[k]
+        fast.start_joint_qd[k] = joints_out.joint_qd[k]
+    parts = int(1)
+    change = float(2.0)
+    while parts <= MAX_PARTS and change > MAX_CHANGE:
+        for k in range(first, end, model.pitch):
+            fast.coarse_joint_q[k] = joints_out.joint_q[k]
+            fast.coarse_joint_qd[k] = joints_out.joint_qd[k]
+            joints_out.joint_q[k] = fast.start_joint_q[k]
+            joints_out.joint_qd[k] = fast.start_joint_qd[k]
+        for part in range(parts):
+            solve_part(
+                p,
+                parts,
+                p.dt * float(part) / float(parts),
+                model,
+                forces,
+                tree,
+                part_model,
+                part_forces,
+                joints_out,
+                bodies_out,
+                factors_out,
+                solve_out,
+                prediction_out,
+            )
+        if parts > 1:
+            change = relative_change(model, tree, fast, joints_out)
+        parts = 2 * parts
+    if change <= MAX_CHANGE:
+        extrapolate(model, tree, fast, joints_out)
+    if max_joint_rate(joints_out.joint_qd, first, size, model.pitch) <= p.max_rate:
+        for k in range(first, end, model.pitch):
+            prediction_out.joint_qd_free[k] = joints_out.joint_qd[k]
+        tree_moved_out[tree] = True
+        tree_phi_out[tree] = 1.0
+    else:
+        for k in range(first, end, model.pitch):
+            joints_out.joint_q[k] = fast.start_joint_q[k]
+            joints_out.joint_qd[k] = fast.start_joint_qd[k]
+        predict_tree(
+            p, model, forces, joints_out, tree, 1.0, bodies_out, factors_out, solve_out, prediction_out
+        )
+        tree_phi_out[tree] = 1.0
