@@ -213,6 +213,7 @@ class ArticulationSolver:
         self.tree_substeps = np.ones(trees, np.int32)
         """[tree] Number of substeps into which the step of each awake tree is divided while the tree has no contact."""
         self._moved = np.zeros(trees, np.bool_)
+        self._fast_steps = np.zeros(trees, np.int32)
         self.tree_budget = np.zeros(trees, np.int32)
         """[tree] How closely the energy of each awake tree is watched: see
         :mod:`vinesim.kernels.plants.energy_budget`."""
@@ -300,6 +301,7 @@ class ArticulationSolver:
                 "divided_floating": self._divided_floating,
                 "tree_substeps": self.tree_substeps,
                 "tree_budget": self.tree_budget,
+                "tree_fast_steps": self._fast_steps,
             },
             float: {
                 "body_mass": self.body_mass,
@@ -374,6 +376,7 @@ class ArticulationSolver:
             rows[bodies] = 0.0
         self.tree_rate[trees] = 0.0
         self._euler_steps[trees] = 0
+        self._fast_steps[trees] = 0
         self.forward_kinematics(trees)
         self.state.tree_awake[trees] = False
         self._list_awake()
@@ -974,6 +977,7 @@ TREE_INPUTS = (
     "tree_rate",
     "tree_awake",
     "tree_moved",
+    "tree_fast_steps",
     "tree_budget",
     "tree_air",
     "root_turn",
@@ -985,7 +989,7 @@ TREE_INPUTS = (
 )
 """Arrays that the kernels of a step read and that do not have a row for each body: lists, arrays of trees and of
 ties."""
-TREE_RESULTS = ("tree_euler_steps", "phi_used", "tree_rate")
+TREE_RESULTS = ("tree_euler_steps", "tree_fast_steps", "phi_used", "tree_rate")
 """Arrays with one element for each tree that the kernels of a step write."""
 SCRATCH = {
     wp.vec3: ("lever", "tension", "Du", "start_joint_qd", "coarse_joint_qd", "part_joint_damping"),
@@ -1016,6 +1020,7 @@ def kernel_parameters(
         "fault_rate": fault_rate,
         "contact_steps": max(1, round(p.contact_onset_duration / dt)) + 1,
         "geometric_stiffness": float(geometric_stiffness),
+        "euler_levers": 0.0,
         "gravity": wp.vec3(0.0, 0.0, -p.gravity),
     }
 
@@ -1341,6 +1346,7 @@ class KernelLaunches:
             fill(s.FastScratch),
             model,
             forces,
+            "tree_fast_steps",
             "tree_moved",
             "phi_used",
             fill(s.JointState),

@@ -14,14 +14,15 @@ and Morris, The extrapolation of first order methods for parabolic partial diffe
 and the same for rotations. The result is of second order, also for the damping of joints and ties. Extrapolated
 backward Euler is L-stable: modes that the step does not resolve are damped as with backward Euler.
 
-A tree takes such a step if one of its bodies turns faster than :data:`FAST_SPIN` at the start of the step, or while
-:mod:`vinesim.kernels.plants.integration` demands backward Euler after fast motion. It does not while contacts press on
-it (their impulses belong to the prediction of the whole step), with a cut-off part, if its step is divided into
+A tree takes such steps from the first step at whose start one of its bodies turns faster than :data:`FAST_SPIN` until
+no body has done so for a second, and while :mod:`vinesim.kernels.plants.integration` demands backward Euler after fast
+motion. A change of scheme twice in each swing would remove energy. A tree does not take them while contacts press on it (their impulses belong to the prediction of the whole step), with a cut-off part, if its step is divided into
 substeps, or near ``max_rate``, where rates are limited.
 """
 
 import warp as wp
 
+from vinesim.kernels.plants.integration import EULER_DURATION
 from vinesim.kernels.plants.kinematics import max_joint_rate
 from vinesim.kernels.plants.prediction import predict_tree
 from vinesim.kernels.plants.spatial import exponential
@@ -40,7 +41,7 @@ from vinesim.kernels.plants.structs import (
 
 wp.set_module_options({"enable_backward": False})
 
-FAST_SPIN = wp.constant(2.0)
+FAST_SPIN = wp.constant(3.0)
 """[rad/s] A body that turns faster makes its tree fast. MEASURED: docs/decisions/integrator.md"""
 
 MAX_SHARE = wp.constant(0.5)
@@ -68,6 +69,7 @@ def is_fast(
     joints: JointState,
     tree: int,
     euler_steps: int,
+    fast_steps_out: wp.array(dtype=wp.int32),
 ):
     """Returns whether a tree takes a step of this module; see there. ``bodies``: motion at the start of the step."""
     first = model.tree_first[tree]
@@ -75,7 +77,11 @@ def is_fast(
     spin = float(0.0)
     for k in range(first, first + size * model.pitch, model.pitch):
         spin = wp.max(spin, wp.length_sq(wp.spatial_bottom(bodies.body_qd[k])))
-    if not spin > FAST_SPIN * FAST_SPIN and euler_steps <= p.contact_steps:
+    steps = wp.max(fast_steps_out[tree] - 1, 0)
+    if spin > FAST_SPIN * FAST_SPIN:
+        steps = int(EULER_DURATION / p.dt)
+    fast_steps_out[tree] = steps
+    if steps == 0 and euler_steps <= p.contact_steps:
         return False
     for k in range(first, first + size * model.pitch, model.pitch):
         wrench = body_wrench[k]
@@ -108,6 +114,7 @@ def solve_part(
     """
     divided = substep_parameters(p, parts)
     divided.fast_rate = NO_DRAG
+    divided.euler_levers = 1.0
     first = model.tree_first[tree]
     end = first + model.tree_moving[tree] * model.pitch
     part_forces.root_turn[tree] = forces.root_turn[tree] + elapsed * forces.root_turn_rate[tree]
@@ -186,6 +193,7 @@ def move_fast_trees(
     fast: FastScratch,
     part_model: ArticulationModel,
     part_forces: AppliedForces,
+    tree_fast_steps_out: wp.array(dtype=wp.int32),
     tree_moved_out: wp.array(dtype=wp.bool),
     tree_phi_out: wp.array(dtype=float),
     joints_out: JointState,
@@ -197,7 +205,8 @@ def move_fast_trees(
     """One thread per tree, before the integration of whole steps. Move the joints of fast trees to the end of the step.
 
     trees: [thread] index of the tree. tree_euler_steps: [tree] number of steps still to be taken with phi = 1. fast,
-    part_model, part_forces, factors_out, solve_out: scratch; see :func:`solve_part`. tree_moved_out: [tree] whether the
+    part_model, part_forces, factors_out, solve_out: scratch; see :func:`solve_part`. tree_fast_steps_out: [tree] number
+    of steps for which the tree still counts as fast. tree_moved_out: [tree] whether the
     tree was moved. tree_phi_out: [tree] 1 for a tree that was moved. joints_out: [body] of a tree that was moved, at
     the end of the step. bodies_out: motion at the start of the step; of a tree that was moved, at the start of the
     second half. prediction_out: accelerations over the second half, joint rates at the end.
@@ -208,7 +217,10 @@ def move_fast_trees(
     tree_moved_out[tree] = False
     if not tree_awake[tree]:
         return
-    if not is_fast(p, model, forces.body_wrench, bodies_out, joints_out, tree, tree_euler_steps[tree]):
+    euler_steps = tree_euler_steps[tree]
+    if not is_fast(
+        p, model, forces.body_wrench, bodies_out, joints_out, tree, euler_steps, tree_fast_steps_out
+    ):
         return
     first = model.tree_first[tree]
     size = model.tree_moving[tree]
