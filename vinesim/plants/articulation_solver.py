@@ -43,7 +43,7 @@ from vinesim.kernels.plants.energy_budget import (
 from vinesim.kernels.plants.first_mode import MAX_SUBSTEPS, begin_substep, substeps_for
 from vinesim.kernels.plants.fast_motion import move_fast_trees
 from vinesim.kernels.plants.floating_components import correct_floating_momentum
-from vinesim.kernels.plants.impulse_response import apply_wrenches, impulse_response
+from vinesim.kernels.plants.impulse_response import apply_wrenches, impulse_response, respond_to_blows
 from vinesim.kernels.plants.integration import integrate
 from vinesim.kernels.plants.joint_wrench import joint_wrench
 from vinesim.kernels.plants.kinematics import forward_kinematics
@@ -515,6 +515,16 @@ class ArticulationSolver:
         """
         self.require_stepped(bodies)
         return self.launches.dense_impulse_response(bodies)
+
+    def blow_response(self, bodies: np.ndarray, points: np.ndarray, axes: np.ndarray) -> np.ndarray:
+        """Returns the velocities [n, n] of points of ``bodies`` [n] along ``axes`` [n, 3] by unit impulses on each of
+        the points along its axis, after :data:`BLOW_DURATION`: 1/kg. Call it between steps.
+
+        ``points`` [n, 3] m, in the world. In so short a time a blow moves only the bodies nearby: the diagonal is the
+        inverse of the mass that each blow meets. Nothing else changes.
+        """
+        self.list_subset(np.unique(self.model.body_tree[bodies]))
+        return self.launches.blow_response(bodies, points, axes)
 
     def integrate(self, bodies: np.ndarray | None = None, wrenches: np.ndarray | None = None) -> None:
         """End the step: integrate the joints with ``wrenches`` [N, N m] that act over the step, at the bodies' origins,
@@ -1028,6 +1038,10 @@ def kernel_parameters(
 BUDGET_PERIOD = 8
 """Period [steps] of the energy check while no tree is watched closely."""
 
+BLOW_DURATION = 1e-3
+"""[s] Time over which the force of a blow is averaged: about that of the contact of a hard body with green wood.
+GUESSED"""
+
 MIN_CAPACITY = 16
 """Smallest capacity of a list of bodies."""
 
@@ -1088,6 +1102,8 @@ class KernelLaunches:
         self._register_arrays(solver)
         self._arrays = self.buffers.arrays
         self._record_transfers()
+        self._numbers = parameters
+        self._blow_bodies = np.zeros(0, np.int32)
         self.parameters = self.fill(structs.SolverParameters, **parameters)
         self._record_step(self.parameters)
         self.shared = self._record_step_kernels(self.parameters)
@@ -1132,6 +1148,7 @@ class KernelLaunches:
         rows = (self.budget.limit, self.budget.watch)
         self._budget_rows = [array.numpy() for array in rows] if buffers.device.is_cpu else []
         buffers.arrays["impact_phi"] = wp.empty(trees, dtype=float, device=buffers.device)
+        buffers.arrays["blow_steps"] = wp.ones(trees, dtype=wp.int32, device=buffers.device)
 
     def _branching(self, parent: np.ndarray) -> np.ndarray:
         """Returns for each place [place] in the kernels' arrays whether the body there has a child other than the next
@@ -1341,6 +1358,7 @@ class KernelLaunches:
             self.count(_WHOLE),
             "stepping",
             "tree_awake",
+            "tree_phi",
             "tree_euler_steps",
             fill(s.AppliedForces),
             fill(s.FastScratch),
@@ -1527,6 +1545,71 @@ class KernelLaunches:
                 prediction,
             )
         )
+
+    def _record_blows(self, capacity: int) -> None:
+        """Record the kernels of :meth:`blow_response` for up to ``capacity`` blows."""
+        buffers = self.buffers
+        fill = self.fill
+        s = structs
+        self._blow_count = buffers.pinned(np.zeros(1, np.int32))
+        self._blow_bodies = buffers.pinned(np.zeros(capacity, np.int32))
+        self._blow_points, self._blow_axes = (buffers.pinned(np.zeros((capacity, 3), np.float32)) for _ in range(2))
+        self._blow_response = buffers.pinned(np.zeros((capacity, capacity), np.float32))
+        bodies = fill(s.BodyState, body_q="after_q", body_qd="after_qd")
+        scratch = fill(s.Scratch)
+        parameters = self.fill(s.SolverParameters, **(self._numbers | {"dt": BLOW_DURATION}))
+        self._respond_to_blows = self.graph(
+            self.launch(
+                predict,
+                parameters,
+                self._model,
+                *self.subset,
+                "tree_phi",
+                "tree_euler_steps",
+                "blow_steps",
+                self._forces,
+                fill(s.JointState),
+                "impact_phi",
+                bodies,
+                self._factors,
+                scratch,
+                fill(
+                    s.Prediction,
+                    body_acceleration="impact_acceleration",
+                    body_qd_free="impact_velocity",
+                    joint_qd_free="start_joint_qd",
+                    joint_xd_free="coarse_joint_qd",
+                ),
+            ),
+            self.launch(
+                respond_to_blows,
+                self._model,
+                buffers.reach(self._blow_count, wp.int32, "blow_count"),
+                buffers.reach(self._blow_bodies, wp.int32, "blow_bodies"),
+                buffers.reach(self._blow_points, wp.vec3, "blow_points"),
+                buffers.reach(self._blow_axes, wp.vec3, "blow_axes"),
+                bodies,
+                self._factors,
+                fill(s.WrenchScratch),
+                scratch,
+                buffers.reach(self._blow_response, float, "blow_response"),
+                threads=1,
+            ),
+        )
+
+    def blow_response(self, bodies: np.ndarray, points: np.ndarray, axes: np.ndarray) -> np.ndarray:
+        """Returns what :meth:`ArticulationSolver.blow_response` returns. The trees of the ``bodies`` [n] must be listed
+        in the subset."""
+        n = len(bodies)
+        if n > len(self._blow_bodies):
+            self._record_blows(max(2 * len(self._blow_bodies), n, MIN_CAPACITY))
+        self._blow_count[0] = n
+        self._blow_bodies[:n] = self.buffers.slots[bodies]
+        self._blow_points[:n] = points
+        self._blow_axes[:n] = axes
+        self._respond_to_blows(max(n, int(self.buffers.host["counts"][_SUBSET])))
+        self.buffers.synchronize()
+        return self._blow_response[:n, :n].astype(float)
 
     def impulse_response(self, bodies: np.ndarray) -> np.ndarray:
         """Returns the velocity changes [n, 6, m, 6] of ``bodies`` [n] by unit impulse wrenches on the bodies of the

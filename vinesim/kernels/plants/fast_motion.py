@@ -16,7 +16,7 @@ backward Euler is L-stable: modes that the step does not resolve are damped as w
 
 A tree takes such steps from the first step at whose start one of its bodies turns faster than :data:`FAST_SPIN` until
 no body has done so for a second, and while :mod:`vinesim.kernels.plants.integration` demands backward Euler after fast
-motion. A change of scheme twice in each swing would remove energy. A tree does not take them while contacts press on it (their impulses belong to the prediction of the whole step), with a cut-off part, if its step is divided into
+motion. A change of scheme twice in each swing would remove energy. A tree does not take them while contacts press on it (their impulses belong to the prediction of the whole step), where phi = 1 is requested, with a cut-off part, if its step is divided into
 substeps, or near ``max_rate``, where rates are limited.
 """
 
@@ -187,6 +187,7 @@ def move_fast_trees(
     count: wp.array(dtype=wp.int32),
     trees: wp.array(dtype=wp.int32),
     tree_awake: wp.array(dtype=wp.bool),
+    tree_phi: wp.array(dtype=float),
     tree_euler_steps: wp.array(dtype=wp.int32),
     forces: AppliedForces,
     # out
@@ -204,7 +205,8 @@ def move_fast_trees(
 ):
     """One thread per tree, before the integration of whole steps. Move the joints of fast trees to the end of the step.
 
-    trees: [thread] index of the tree. tree_euler_steps: [tree] number of steps still to be taken with phi = 1. fast,
+    trees: [thread] index of the tree. tree_phi: [tree] requested phi (implicitness of the integrator, 0.5 trapezoidal to
+    1 backward Euler). tree_euler_steps: [tree] number of steps still to be taken with phi = 1. fast,
     part_model, part_forces, factors_out, solve_out: scratch; see :func:`solve_part`. tree_fast_steps_out: [tree] number
     of steps for which the tree still counts as fast. tree_moved_out: [tree] whether the
     tree was moved. tree_phi_out: [tree] 1 for a tree that was moved. joints_out: [body] of a tree that was moved, at
@@ -215,7 +217,7 @@ def move_fast_trees(
         return
     tree = trees[wp.tid()]
     tree_moved_out[tree] = False
-    if not tree_awake[tree]:
+    if not tree_awake[tree] or tree_phi[tree] == 1.0 or p.geometric_stiffness == 0.0:
         return
     euler_steps = tree_euler_steps[tree]
     if not is_fast(
