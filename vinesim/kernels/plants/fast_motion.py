@@ -53,7 +53,7 @@ MAX_PARTS = wp.constant(8)
 NO_DRAG = wp.constant(1.0e6)
 """[rad/s] Rate above which a drag slows the bodies of a fast tree: never."""
 
-MAX_CHANGE = wp.constant(0.1)
+MAX_CHANGE = wp.constant(0.05)
 """Largest difference of rates between halves and whole step, as a share of the largest rate, that is extrapolated.
 
 With a larger one the result of the halves counts, which is of first order and damped. TUNED
