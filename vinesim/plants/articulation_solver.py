@@ -1359,6 +1359,7 @@ class KernelLaunches:
             "stepping",
             "tree_awake",
             "tree_phi",
+            "tree_rate",
             "tree_euler_steps",
             fill(s.AppliedForces),
             fill(s.FastScratch),

@@ -188,6 +188,7 @@ def move_fast_trees(
     trees: wp.array(dtype=wp.int32),
     tree_awake: wp.array(dtype=wp.bool),
     tree_phi: wp.array(dtype=float),
+    tree_rate: wp.array(dtype=float),
     tree_euler_steps: wp.array(dtype=wp.int32),
     forces: AppliedForces,
     # out
@@ -206,7 +207,7 @@ def move_fast_trees(
     """One thread per tree, before the integration of whole steps. Move the joints of fast trees to the end of the step.
 
     trees: [thread] index of the tree. tree_phi: [tree] requested phi (implicitness of the integrator, 0.5 trapezoidal to
-    1 backward Euler). tree_euler_steps: [tree] number of steps still to be taken with phi = 1. fast,
+    1 backward Euler). tree_rate: [tree] rad/s, largest joint rate after the last step. tree_euler_steps: [tree] number of steps still to be taken with phi = 1. fast,
     part_model, part_forces, factors_out, solve_out: scratch; see :func:`solve_part`. tree_fast_steps_out: [tree] number
     of steps for which the tree still counts as fast. tree_moved_out: [tree] whether the
     tree was moved. tree_phi_out: [tree] 1 for a tree that was moved. joints_out: [body] of a tree that was moved, at
@@ -220,12 +221,16 @@ def move_fast_trees(
     if not tree_awake[tree] or tree_phi[tree] == 1.0 or p.geometric_stiffness == 0.0:
         return
     euler_steps = tree_euler_steps[tree]
-    if not is_fast(
-        p, model, forces.body_wrench, bodies_out, joints_out, tree, euler_steps, tree_fast_steps_out
+    size = model.tree_moving[tree]
+    if (
+        float(size) * tree_rate[tree] < FAST_SPIN  # no body can turn faster than all joints together
+        and tree_fast_steps_out[tree] == 0
+        and euler_steps <= p.contact_steps
     ):
         return
+    if not is_fast(p, model, forces.body_wrench, bodies_out, joints_out, tree, euler_steps, tree_fast_steps_out):
+        return
     first = model.tree_first[tree]
-    size = model.tree_moving[tree]
     end = first + size * model.pitch
     for k in range(first, end, model.pitch):
         fast.start_joint_q[k] = joints_out.joint_q[k]
