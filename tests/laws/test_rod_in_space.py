@@ -279,7 +279,8 @@ def test_limp_threads_slow_down(beta: float) -> None:
 
 
 def test_a_fast_tree_keeps_phi_1_until_it_has_been_slow_for_a_second() -> None:
-    """Joints above 3 rad/s or a body above 3 rad/s make it fast. A slow tree keeps phi 0.55; one that is touched while below ``brisk`` returns to it at once."""
+    """A joint or a body above 3 rad/s makes it fast. A slow tree keeps phi 0.55; one that is touched while below
+    ``brisk`` returns to it at once."""
     trees = [beam_theory.Beam(beta=0.004).tree(i) for i in range(3)]
     for tree in trees:
         tree.solve_rest_pose()

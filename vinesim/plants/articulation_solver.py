@@ -40,8 +40,8 @@ from vinesim.kernels.plants.energy_budget import (
     choose_budget,
     keep_budget,
 )
-from vinesim.kernels.plants.first_mode import MAX_SUBSTEPS, begin_substep, substeps_for
 from vinesim.kernels.plants.fast_motion import move_fast_trees
+from vinesim.kernels.plants.first_mode import MAX_SUBSTEPS, begin_substep, substeps_for
 from vinesim.kernels.plants.floating_components import correct_floating_momentum
 from vinesim.kernels.plants.impulse_response import apply_wrenches, impulse_response, respond_to_blows
 from vinesim.kernels.plants.integration import integrate
