@@ -134,8 +134,8 @@ def first_blow(dt: float, speed: float, place: float, radius: float, gap: float)
 def test_the_peak_of_a_blow_is_told_at_any_step(speed: float, place: float, radius: float) -> None:
     """At 10 ms the peak within the tick is that at 1 ms within 20 %, wherever in the tick the blow begins.
 
-    The peak at 1 ms depends on where within the millisecond the blow begins: their mean counts. The mean over the first tick of
-    10 ms is 1 to 41 % of it: a peak lasts as long as the wood beside the contact is at rest.
+    The peak at 1 ms depends on where within the millisecond the blow begins: their mean counts. The mean force over the
+    first tick of 10 ms is 1 to 41 % of it: a peak lasts as long as the wood beside the contact is at rest.
     """
     shares = (0.1, 0.3, 0.5, 0.7, 0.9)
     gap = 0.02 * speed

@@ -50,7 +50,7 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     damping, to 1 backward Euler. TUNED."""
     fast_joint_rate: Positive = 5.0
     """[rad/s] A tree with a joint faster than this is integrated with backward Euler (:attr:`phi` = 1). A body that
-    turns faster than this is slowed by a drag. TUNED."""
+    turns faster than this is slowed by a drag, unless its tree takes steps for fast motion. TUNED."""
     max_joint_rate: Positive = 50.0
     """[rad/s] Limit of the rates of plants' joints. DERIVED: half a radian in a step of 10 ms."""
     fault_joint_rate: Positive = 5000.0

@@ -272,10 +272,8 @@ def move_fast_trees(
         for k in range(first, end, model.pitch):
             prediction_out.joint_qd_free[k] = joints_out.joint_qd[k]
         tree_moved_out[tree] = True
-        tree_phi_out[tree] = 1.0
-    else:
+    else:  # the integration slows or stops the tree
         for k in range(first, end, model.pitch):
             joints_out.joint_q[k] = fast.start_joint_q[k]
             joints_out.joint_qd[k] = fast.start_joint_qd[k]
-        predict_tree(p, model, forces, joints_out, tree, 1.0, bodies_out, factors_out, solve_out, prediction_out)
-        tree_phi_out[tree] = 1.0
+    tree_phi_out[tree] = 1.0
