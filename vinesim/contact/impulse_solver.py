@@ -307,10 +307,11 @@ class ImpulseSolver:
         """
         contacts = self.contacts
         force = np.linalg.norm(contacts.force[:count], axis=1)
-        keys = (contacts.feature[:count].astype(np.int64) << 32) + contacts.other[:count]
         closing = -self.rows.velocity_free[0 : 3 * count : 3]
-        pressed = self.rows.impulse[0 : 3 * count : 3] > 0.0
-        new = np.flatnonzero(pressed & (closing > MIN_BLOW_SPEED) & ~np.isin(keys, pressed_before))
+        new = np.flatnonzero((closing > MIN_BLOW_SPEED) & (self.rows.impulse[0 : 3 * count : 3] > 0.0))
+        if len(new):
+            keys = (contacts.feature[new].astype(np.int64) << 32) + contacts.other[new]
+            new = new[~np.isin(keys, pressed_before)]
         h = BLOW_DURATION
         if len(new) == 0 or self.parameters.dt <= h:
             return force
