@@ -2,8 +2,8 @@
 the external forces.
 
 The integration of joints changes the momentum of a free tree by an error of about dt^2. So the root's pose and rate are
-corrected after the integration, until linear momentum and the centre of mass, and without contacts also angular
-momentum, are exact.
+corrected after the integration, until linear and angular momentum and the centre of mass are exact (angular momentum
+not in the first steps of a contact, see below).
 
 The component's centre of mass moves, and its root turns, at the mean of the rates before and after the step. A
 component with contacts moves at the rate after the step instead, as the contact solve assumes. With the mean rate it
@@ -222,7 +222,7 @@ def correct_floating_momentum(
     locked = locked - point_mass_inertia(mass, com_now)
     rotation = wp.quat_identity()
     turn = wp.vec3()
-    if not is_pressed:
+    if not (is_pressed and tree_phi[tree] == 1.0):
         rotation, turn = angular_correction(locked, angular_now, goal_angular, dt)
     rate = wp.quat_rotate(rotation, joints_out.joint_qd[root]) + turn
     square = wp.length_sq(rate)
