@@ -45,15 +45,18 @@ def energy(plants: ArticulationSolver, gravity: float, trees: np.ndarray | None 
     holds a cane to a wire) that is stretched by d. A tie that deflects its wire by u counts k d (d + u) / 2, which
     includes its share of the wire. If a tree grows on an arm (horizontal old wood) that it twists by u, the joint of
     its root counts less by k u (theta - theta_0) / 2, with theta_0 the rotation in equilibrium
-    (``Model.joint_settled``).
+    (``Model.joint_settled``). The springs of berry clusters count also while the clusters are locked to their bunch, in
+    the pose in which they are locked, so that nothing changes when they are unlocked.
     """
     model = plants.model
     state = plants.state
     bodies = _moving_bodies(plants, trees)
     mass, com, velocity, omega, inertia = _motion(plants, bodies)
     kinetic = 0.5 * float(mass @ (velocity**2).sum(1) + np.einsum("bi,bij,bj->", omega, inertia, omega))
+    sprung = _bodies(plants, trees)
+    turned = frames.log(state.joint_q[sprung].astype(float))
+    elastic = 0.5 * float((plants.joint_stiffness[sprung] * turned**2).sum())
     turned = frames.log(state.joint_q[bodies].astype(float))
-    elastic = 0.5 * float((plants.joint_stiffness[bodies] * turned**2).sum())
     roots = plants.body_parent[bodies] < 0
     since = turned[roots] - frames.log(plants.joint_settled[bodies[roots]].astype(float))
     arm_turn = plants.root_rests.turn[model.body_tree[bodies[roots]]]
@@ -78,15 +81,19 @@ def momentum(plants: ArticulationSolver, trees: np.ndarray | None = None) -> Mom
     return Momentum(impulse.sum(0), spin.sum(0))
 
 
+def _bodies(plants: ArticulationSolver, trees: np.ndarray | None) -> np.ndarray:
+    """Returns the indices [k] of all bodies of ``trees``, sorted."""
+    model = plants.model
+    return np.arange(len(model.body_mass)) if trees is None else np.flatnonzero(np.isin(model.body_tree, trees))
+
+
 def _moving_bodies(plants: ArticulationSolver, trees: np.ndarray | None) -> np.ndarray:
     """Returns the indices [k] of the simulated bodies of ``trees``. Berry clusters that are locked to their bunch are
     not bodies of their own."""
     model = plants.model
-    number = np.arange(len(model.body_mass)) - model.tree_first[model.body_tree]
-    moving = number < plants.tree_moving[model.body_tree]
-    if trees is not None:
-        moving &= np.isin(model.body_tree, trees)
-    return np.flatnonzero(moving)
+    bodies = _bodies(plants, trees)
+    tree = model.body_tree[bodies]
+    return bodies[bodies - model.tree_first[tree] < plants.tree_moving[tree]]
 
 
 def _motion(plants: ArticulationSolver, bodies: np.ndarray) -> tuple[np.ndarray, ...]:

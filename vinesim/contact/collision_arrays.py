@@ -86,6 +86,7 @@ class PlantArrays:
             tree_last_bunch=last_bunch,
             body=capsules.body,
             bunch=capsules.bunch,
+            branch=capsules.branch,
             level=capsules.level,
             local_start=capsules.start,
             local_end=capsules.end,

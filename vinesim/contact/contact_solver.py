@@ -74,6 +74,7 @@ class ContactSolver:
         self._reported: tuple[Contact, ...] | None = ()
         self._touched: tuple[tuple[int, str], ...] | None = ()
         self._generation = 0
+        self._pressed = self._pressed_before = np.zeros(0, np.int64)
         self._kernel_parameters = numbers = kernel_parameters(self.parameters)
         self._arrays = PlantArrays(model, plants, self.capsules)
         self._rigid_arrays: RigidArrays | None = None
@@ -115,6 +116,8 @@ class ContactSolver:
             self._reported = self._touched = None
         else:
             self.impulses.clear()
+        self._pressed_before = self._pressed
+        self._pressed = self.impulses.pressed_keys(self.count)
 
     def _wake_reached_trees(self) -> np.ndarray:
         """Wake the sleeping trees that awake trees touch, then the sleeping trees that these touch, and so on.
@@ -209,6 +212,7 @@ class ContactSolver:
             contacts = self.impulses.contacts
             force = contacts.force[:n]
             pressure = self.impulses.rows.impulse[0 : 3 * n : 3]
+            peak = self.impulses.peaks(n, self._pressed_before)
             self._reported = tuple(
                 Contact(
                     *self._actor_and_link(other),
@@ -216,6 +220,7 @@ class ContactSolver:
                     contacts.point[c].copy(),
                     -force[c],
                     float(contacts.gap[c]),
+                    float(peak[c]),
                 )
                 for c, other in enumerate(contacts.other[:n].tolist())
                 if pressure[c] > 0.0

@@ -20,13 +20,19 @@ from vinesim.kernels.contact import delassus, forces, islands, jacobians, projec
 from vinesim.kernels.contact.friction_law import Steps, Surface
 from vinesim.kernels.contact.island_system import IslandSystem
 from vinesim.kernels.graph import KernelGraph, KernelLaunch
-from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.plants.articulation_solver import BLOW_DURATION, ArticulationSolver
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.wires.deflected_wires import DeflectedWires, WireContacts
 
 MATRIX_CONTACTS = 16
 """Initial capacity [contacts in a block] of the matrices. They grow if blocks are larger."""
+MIN_BLOW_SPEED = 0.02
+"""[m/s] A contact that closes more slowly is no blow: its force is that of the step. TUNED"""
+BLOW_SWEEPS = 100
+"""Largest number of sweeps of :func:`pressing_impulses`. TUNED: ten are usual."""
+BLOW_TOLERANCE = 1e-3
+"""[1] The sweeps end when no impulse changes by more than this share of the largest one."""
 REMOVED_GEOM = np.iinfo(np.int32).max
 """Index that the stored impulses of the last step (warm start) have for a geom that no longer exists."""
 
@@ -283,6 +289,46 @@ class ImpulseSolver:
         contacts.wire_stiffness[at] = wires.stiffness
         contacts.wire_shift[at] = wires.shift
 
+    def pressed_keys(self, count: int) -> np.ndarray:
+        """Returns a number [k] for each of the first ``count`` contacts that carries a force; it is that of the same
+        contact in another step."""
+        contacts = self.contacts
+        keys = (contacts.feature[:count].astype(np.int64) << 32) + contacts.other[:count]
+        return keys[self.rows.impulse[0 : 3 * count : 3] > 0.0]
+
+    def peaks(self, count: int, pressed_before: np.ndarray) -> np.ndarray:
+        """Returns the largest force [count] N within the step of each of the first ``count`` contacts, as a mean over
+        :data:`BLOW_DURATION`. ``pressed_before``: :meth:`pressed_keys` of the last step.
+
+        A contact that began in this step ends the closing speed v along its normal. In the first moment it moves only
+        the mass m next to it: the force is v / (1 / m + c) / h over the duration h, with c the compliance of the
+        contact over h. Contacts that began together are solved together. The step spreads the impulse over its
+        duration, and moves more mass. Call it between steps.
+        """
+        contacts = self.contacts
+        force = np.linalg.norm(contacts.force[:count], axis=1)
+        closing = -self.rows.velocity_free[0 : 3 * count : 3]
+        new = np.flatnonzero((closing > MIN_BLOW_SPEED) & (self.rows.impulse[0 : 3 * count : 3] > 0.0))
+        if len(new):
+            keys = (contacts.feature[new].astype(np.int64) << 32) + contacts.other[new]
+            new = new[~np.isin(keys, pressed_before)]
+        h = BLOW_DURATION
+        if len(new) == 0 or self.parameters.dt <= h:
+            return force
+        between = contacts.other_body[new] >= 0
+        side = np.concatenate([np.arange(len(new)), np.flatnonzero(between)])
+        body = np.concatenate([contacts.body[new], contacts.other_body[new[between]]])
+        sign = np.where(np.arange(len(side)) < len(new), 1.0, -1.0)[:, None] * np.eye(len(new))[side]
+        at = new[side]
+        mobility = sign.T @ self.plants.blow_response(body, contacts.point[at], contacts.axes[at, 0]) @ sign
+        rows = self.rows
+        mobility += rows.rigid_jacobian[new, :, 0] @ rows.rigid_response[new, :, 0].T
+        surface = contacts.surface[new]
+        mobility += np.diag(1.0 / (h * (surface["stiffness"] * h + surface["damping"])))
+        blow = pressing_impulses(mobility, closing[new])
+        force[new] = np.maximum(force[new], blow / h)
+        return force
+
     def report_wires(self) -> None:
         """Pass the contact forces of the last solve on wires to :class:`DeflectedWires`."""
         wires = self._wires
@@ -463,3 +509,17 @@ class ImpulseSolver:
 def by_rows(jacobian: np.ndarray) -> np.ndarray:
     """Returns a rigid Jacobian [contact, dof, 3] as rows [row, dof]."""
     return jacobian.transpose(0, 2, 1).reshape(-1, jacobian.shape[1])
+
+
+def pressing_impulses(mobility: np.ndarray, closing: np.ndarray) -> np.ndarray:
+    """Returns the impulses x [n] N s, at least 0, that end the closing speeds [n] m/s: mobility x >= closing, with
+    equality where x > 0. ``mobility``: [n, n] 1/kg, positive definite. By projected Gauss-Seidel."""
+    impulse = np.zeros(len(closing))
+    for _ in range(BLOW_SWEEPS):
+        before = impulse.copy()
+        for i in range(len(closing)):
+            missing = closing[i] - mobility[i] @ impulse
+            impulse[i] = max(impulse[i] + missing / mobility[i, i], 0.0)
+        if np.abs(impulse - before).max() <= BLOW_TOLERANCE * impulse.max():
+            break
+    return impulse

@@ -29,6 +29,12 @@ class PlantCapsules:
 
     The capsule of a peduncle belongs to its bunch: once the bunch is picked, the remaining stub does not collide.
     """
+    branch: np.ndarray
+    """[capsule] Number of the unbranched axis of its tree to which wood belongs: 0 for the main axis, more for side
+    shoots; -1 for bunches and peduncles.
+
+    Capsules of one axis do not touch each other.
+    """
     level: np.ndarray
     """[capsule] Level of detail at which the capsule exists.
 
@@ -83,12 +89,29 @@ def plant_capsules(model: Model) -> PlantCapsules:
         tree_start=np.searchsorted(body, np.append(model.tree_first, len(model.body_mass))).astype(np.int32),
         body=body.astype(np.int32),
         bunch=bunch.astype(np.int32),
+        branch=np.where(bunch < 0, branches(model)[body.astype(np.int32)], -1).astype(np.int32),
         level=level.astype(np.int32),
         start=start.astype(np.float32)[:, None] * along,
         end=end.astype(np.float32)[:, None] * along,
         radius=radius.astype(np.float32),
         material=materials_of_organs(model.body_organ[body.astype(np.int32)]),
     )
+
+
+def branches(model: Model) -> np.ndarray:
+    """Returns the number of the unbranched axis [body] to which each body of a tree belongs: an axis continues with the
+    first child of each body. 0 for the axis that begins at the tree's root."""
+    branch = np.zeros(len(model.body_mass), np.int32)
+    parent = model.body_parent
+    has_parent = parent >= 0
+    first_child = np.full(len(parent) + 1, len(parent))
+    np.minimum.at(first_child, parent[has_parent], np.flatnonzero(has_parent))
+    starts = has_parent & (first_child[parent] != np.arange(len(parent)))
+    number = np.cumsum(starts)
+    before = np.concatenate([[0], number])[model.tree_first[model.body_tree]]
+    for body in np.flatnonzero(has_parent).tolist():
+        branch[body] = number[body] - before[body] if starts[body] else branch[parent[body]]
+    return branch
 
 
 def spheroid_spheres(half_length: float, max_radius: float) -> list[tuple[float, float]]:

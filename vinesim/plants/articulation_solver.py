@@ -42,9 +42,10 @@ from vinesim.kernels.plants.energy_budget import (
     choose_budget,
     keep_budget,
 )
+from vinesim.kernels.plants.fast_motion import move_fast_trees
 from vinesim.kernels.plants.first_mode import MAX_SUBSTEPS, begin_substep, substeps_for
 from vinesim.kernels.plants.floating_components import correct_floating_momentum
-from vinesim.kernels.plants.impulse_response import apply_wrenches, impulse_response
+from vinesim.kernels.plants.impulse_response import apply_wrenches, impulse_response, respond_to_blows
 from vinesim.kernels.plants.integration import integrate
 from vinesim.kernels.plants.joint_wrench import joint_wrench
 from vinesim.kernels.plants.kinematics import forward_kinematics
@@ -218,6 +219,8 @@ class ArticulationSolver:
         self._fastest = np.zeros(1, np.float32)
         self.tree_substeps = np.ones(trees, np.int32)
         """[tree] Number of substeps into which the step of each awake tree is divided while the tree has no contact."""
+        self._moved = np.zeros(trees, np.bool_)
+        self._fast_steps = np.zeros(trees, np.int32)
         self.tree_budget = np.zeros(trees, np.int32)
         """[tree] How closely the energy of each awake tree is watched: see
         :mod:`vinesim.kernels.plants.energy_budget`."""
@@ -317,6 +320,7 @@ class ArticulationSolver:
                 "divided_floating": self._divided_floating,
                 "tree_substeps": self.tree_substeps,
                 "tree_budget": self.tree_budget,
+                "tree_fast_steps": self._fast_steps,
             },
             float: {
                 "body_mass": self.body_mass,
@@ -330,7 +334,7 @@ class ArticulationSolver:
                 "fastest": self._fastest,
             },
             wp.vec2i: {"tie_span": ties.span, "groups": self._groups},
-            wp.bool: {"tree_awake": state.tree_awake, "body_falls": self._falls},
+            wp.bool: {"tree_awake": state.tree_awake, "tree_moved": self._moved, "body_falls": self._falls},
             wp.vec3: {
                 "body_offset": self._offset,
                 "body_com": self.body_com,
@@ -391,6 +395,7 @@ class ArticulationSolver:
             rows[bodies] = 0.0
         self.tree_rate[trees] = 0.0
         self._euler_steps[trees] = 0
+        self._fast_steps[trees] = 0
         self.forward_kinematics(trees)
         self.state.tree_awake[trees] = False
         self._list_awake()
@@ -568,6 +573,16 @@ class ArticulationSolver:
         """
         self.require_stepped(bodies)
         return self.launches.dense_impulse_response(bodies)
+
+    def blow_response(self, bodies: np.ndarray, points: np.ndarray, axes: np.ndarray) -> np.ndarray:
+        """Returns the velocities [n, n] of points of ``bodies`` [n] along ``axes`` [n, 3] by unit impulses on each of
+        the points along its axis, after :data:`BLOW_DURATION`: 1/kg. Call it between steps.
+
+        ``points`` [n, 3] m, in the world. In so short a time a blow moves only the bodies nearby: the diagonal is the
+        inverse of the mass that each blow meets. Nothing else changes.
+        """
+        self.list_subset(np.unique(self.model.body_tree[bodies]))
+        return self.launches.blow_response(bodies, points, axes)
 
     def integrate(self, bodies: np.ndarray | None = None, wrenches: np.ndarray | None = None) -> None:
         """End the step: integrate the joints with ``wrenches`` [N, N m] that act over the step, at the bodies' origins,
@@ -1287,6 +1302,8 @@ TREE_INPUTS = (
     "tree_steps",
     "tree_rate",
     "tree_awake",
+    "tree_moved",
+    "tree_fast_steps",
     "tree_budget",
     "tree_air",
     "root_turn",
@@ -1298,11 +1315,11 @@ TREE_INPUTS = (
 )
 """Arrays that the kernels of a step read and that do not have a row for each body: lists, arrays of trees and of
 ties."""
-TREE_RESULTS = ("tree_euler_steps", "phi_used", "tree_rate")
+TREE_RESULTS = ("tree_euler_steps", "tree_fast_steps", "phi_used", "tree_rate")
 """Arrays with one element for each tree that the kernels of a step write."""
 SCRATCH = {
-    wp.vec3: ("lever", "tension", "Du"),
-    wp.quat: ("axes",),
+    wp.vec3: ("lever", "tension", "Du", "start_joint_qd", "coarse_joint_qd", "part_joint_damping"),
+    wp.quat: ("axes", "start_joint_q", "coarse_joint_q"),
     wp.mat33: ("J", "H", "M", "D", "DJ", "DH", "root_inverse_mass"),
     wp.transform: ("after_q",),
     wp.spatial_vector: (
@@ -1329,12 +1346,17 @@ def kernel_parameters(
         "fault_rate": fault_rate,
         "contact_steps": max(1, round(p.contact_onset_duration / dt)) + 1,
         "geometric_stiffness": float(geometric_stiffness),
+        "euler_levers": 0.0,
         "gravity": wp.vec3(0.0, 0.0, -p.gravity),
     }
 
 
 BUDGET_PERIOD = 8
 """Period [steps] of the energy check while no tree is watched closely."""
+
+BLOW_DURATION = 1.25e-3
+"""[s] Time over which the force of a blow is averaged. TUNED: the peak is then the mean of the peaks at dt = 1 ms over
+the moments within a step at which the blow may begin; these peaks differ by up to 20 % from their mean."""
 
 MIN_CAPACITY = 16
 """Smallest capacity of a list of bodies."""
@@ -1396,6 +1418,8 @@ class KernelLaunches:
         self._register_arrays(solver)
         self._arrays = self.buffers.arrays
         self._record_transfers()
+        self._numbers = parameters
+        self._blow_bodies = np.zeros(0, np.int32)
         self.parameters = self.fill(structs.SolverParameters, **parameters)
         self._record_step(self.parameters)
         self.shared = self._record_step_kernels(self.parameters)
@@ -1440,6 +1464,7 @@ class KernelLaunches:
         rows = (self.budget.limit, self.budget.watch)
         self._budget_rows = [array.numpy() for array in rows] if buffers.device.is_cpu else []
         buffers.arrays["impact_phi"] = wp.empty(trees, dtype=float, device=buffers.device)
+        buffers.arrays["blow_steps"] = wp.ones(trees, dtype=wp.int32, device=buffers.device)
 
     def _branching(self, parent: np.ndarray) -> np.ndarray:
         """Returns for each place [place] in the kernels' arrays whether the body there has a child other than the next
@@ -1579,8 +1604,9 @@ class KernelLaunches:
             threads=1,
         )
         predict_divided = self._predict(parameters, _DIVIDED, "divided")
-        whole = self._integrate(parameters, _WHOLE, "stepping", _FLOATING, "floating")
-        divided = self._integrate(parameters, _DIVIDED, "divided", _DIVIDED_FLOATING, "divided_floating")
+        fast = [self._move_fast_trees(parameters)] if self._max_substeps > 1 else []
+        whole = self._integrate(parameters, _WHOLE, "stepping", _FLOATING, "floating", fast)
+        divided = self._integrate(parameters, _DIVIDED, "divided", _DIVIDED_FLOATING, "divided_floating", [])
         return Step(
             self.graph(predict),
             {which: self.graph(*launches) for which, launches in whole.items()},
@@ -1633,11 +1659,49 @@ class KernelLaunches:
             self.fill(structs.Prediction),
         )
 
+    def _move_fast_trees(self, parameters: Any) -> KernelLaunch:
+        """Returns the launch that moves fast trees, before the integration of whole steps."""
+        fill = self.fill
+        s = structs
+        device = self.buffers.device
+        scratch = {
+            name: wp.empty_like(self._arrays[name], device=device)
+            for name in ("tie_damping", "tie_anchor", "root_turn")
+        }
+        own = {"joint_damping": "part_joint_damping"}
+        model, forces = fill(s.ArticulationModel, **own), fill(s.AppliedForces)
+        for name, array in scratch.items():
+            setattr(model if name == "tie_damping" else forces, name, array)
+        return self.launch(
+            move_fast_trees,
+            parameters,
+            fill(s.ArticulationModel),
+            self.count(_WHOLE),
+            "stepping",
+            "tree_awake",
+            "tree_phi",
+            "tree_rate",
+            "tree_euler_steps",
+            fill(s.AppliedForces),
+            fill(s.FastScratch),
+            model,
+            forces,
+            "tree_fast_steps",
+            "tree_moved",
+            "phi_used",
+            fill(s.JointState),
+            fill(s.BodyState),
+            fill(s.Factors),
+            fill(s.Scratch),
+            fill(s.Prediction),
+        )
+
     def _integrate(
-        self, parameters: Any, count: int, trees: str, root_count: int, roots: str
+        self, parameters: Any, count: int, trees: str, root_count: int, roots: str, first: list[KernelLaunch]
     ) -> dict[tuple[bool, bool], list[KernelLaunch]]:
         """Returns the launches of an integration for each combination of two conditions, which are the key: whether
-        energy budgets are kept, and whether there are floating roots.
+        energy budgets are kept, and whether there are floating roots. ``first``: launches that come before the joints
+        are moved.
         """
         fill = self.fill
         s = structs
@@ -1667,6 +1731,7 @@ class KernelLaunches:
             "tree_awake",
             "phi_used",
             "tree_steps",
+            "tree_moved",
             joints,
             prediction,
             "tree_rate",
@@ -1696,10 +1761,10 @@ class KernelLaunches:
         stepping = (self.count(_STEPPING), "stepping")
         last = [] if self.buffers.has_copies else [self.launch(find_fastest, *stepping, "tree_rate", "fastest")]
         return {
-            (False, False): [move, *last],
-            (False, True): [move, correct, *last],
-            (True, False): [begin, move, keep, *last],
-            (True, True): [begin, move, keep, correct, *last],
+            (False, False): [*first, move, *last],
+            (False, True): [*first, move, correct, *last],
+            (True, False): [begin, *first, move, keep, *last],
+            (True, True): [begin, *first, move, keep, correct, *last],
         }
 
     def _correct_momentum(self, parameters: Any, count: int, roots: str) -> KernelLaunch:
@@ -1802,6 +1867,71 @@ class KernelLaunches:
                 prediction,
             )
         )
+
+    def _record_blows(self, capacity: int) -> None:
+        """Record the kernels of :meth:`blow_response` for up to ``capacity`` blows."""
+        buffers = self.buffers
+        fill = self.fill
+        s = structs
+        self._blow_count = buffers.pinned(np.zeros(1, np.int32))
+        self._blow_bodies = buffers.pinned(np.zeros(capacity, np.int32))
+        self._blow_points, self._blow_axes = (buffers.pinned(np.zeros((capacity, 3), np.float32)) for _ in range(2))
+        self._blow_response = buffers.pinned(np.zeros((capacity, capacity), np.float32))
+        bodies = fill(s.BodyState, body_q="after_q", body_qd="after_qd")
+        scratch = fill(s.Scratch)
+        parameters = self.fill(s.SolverParameters, **(self._numbers | {"dt": BLOW_DURATION}))
+        self._respond_to_blows = self.graph(
+            self.launch(
+                predict,
+                parameters,
+                self._model,
+                *self.subset,
+                "tree_phi",
+                "tree_euler_steps",
+                "blow_steps",
+                self._forces,
+                fill(s.JointState),
+                "impact_phi",
+                bodies,
+                self._factors,
+                scratch,
+                fill(
+                    s.Prediction,
+                    body_acceleration="impact_acceleration",
+                    body_qd_free="impact_velocity",
+                    joint_qd_free="start_joint_qd",
+                    joint_xd_free="coarse_joint_qd",
+                ),
+            ),
+            self.launch(
+                respond_to_blows,
+                self._model,
+                buffers.reach(self._blow_count, wp.int32, "blow_count"),
+                buffers.reach(self._blow_bodies, wp.int32, "blow_bodies"),
+                buffers.reach(self._blow_points, wp.vec3, "blow_points"),
+                buffers.reach(self._blow_axes, wp.vec3, "blow_axes"),
+                bodies,
+                self._factors,
+                fill(s.WrenchScratch),
+                scratch,
+                buffers.reach(self._blow_response, float, "blow_response"),
+                threads=1,
+            ),
+        )
+
+    def blow_response(self, bodies: np.ndarray, points: np.ndarray, axes: np.ndarray) -> np.ndarray:
+        """Returns what :meth:`ArticulationSolver.blow_response` returns. The trees of the ``bodies`` [n] must be listed
+        in the subset."""
+        n = len(bodies)
+        if n > len(self._blow_bodies):
+            self._record_blows(max(2 * len(self._blow_bodies), n, MIN_CAPACITY))
+        self._blow_count[0] = n
+        self._blow_bodies[:n] = self.buffers.slots[bodies]
+        self._blow_points[:n] = points
+        self._blow_axes[:n] = axes
+        self._respond_to_blows(max(n, int(self.buffers.host["counts"][_SUBSET])))
+        self.buffers.synchronize()
+        return self._blow_response[:n, :n].astype(float)
 
     def impulse_response(self, bodies: np.ndarray) -> np.ndarray:
         """Returns the velocity changes [n, 6, m, 6] of ``bodies`` [n] by unit impulse wrenches on the bodies of the

@@ -152,7 +152,7 @@ def add_free_bunch(spec: mujoco.MjSpec, bunch: FreeBunch, parameters: PhysicsPar
     """Add a bunch to a world as a free body; ``ValueError`` if it has too many shapes or none."""
     if not 0 < len(bunch.radius) <= MAX_GEOMS:
         raise ValueError(f"a bunch has {len(bunch.radius)} collision shapes; a free bunch can have 1 to {MAX_GEOMS}")
-    friction = contact_friction(parameters.friction, parameters.bunch_rolling_arm)
+    widest = max(float(radius) for radius in bunch.radius)
     softness = [parameters.bunch_contact_time, parameters.bunch_contact_damping_ratio]
     yz, zx, xy = bunch.product
     body = spec.worldbody.add_body(
@@ -172,7 +172,7 @@ def add_free_bunch(spec: mujoco.MjSpec, bunch: FreeBunch, parameters: PhysicsPar
             contype=FREE_BUNCH,
             conaffinity=CONAFFINITY,
             condim=6,
-            friction=friction,
+            friction=contact_friction(parameters.friction, parameters.bunch_rolling_arm * float(radius) / widest),
             priority=1,
             solref=softness,
             solimp=_SOLIMP,

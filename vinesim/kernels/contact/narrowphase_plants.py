@@ -1,4 +1,4 @@
-"""Narrowphase of plants among themselves: bunches against wood and other bunches of their tree, and tree against tree.
+"""Narrowphase of plants among themselves: bunches and side shoots against other parts of their tree, tree against tree.
 
 Two capsules that overlap, or almost touch, in the generated rest pose of all plants are in contact only if they come
 closer than in that pose.
@@ -129,18 +129,26 @@ def plant_candidate(
 @wp.func
 def may_touch_own_tree(s: int, tree: int, low: wp.vec3, high: wp.vec3, capsules: Capsules, wood_boxes: Aabbs):
     """Returns whether a capsule with this box may touch another capsule of its tree. Bunches can touch wood, and
-    bunches with a higher index.
+    bunches with a higher index; side shoots can touch axes with a lower number.
     """
-    clear = aabbs_disjoint(low, high, wood_boxes.low[tree], wood_boxes.high[tree])
-    return capsules.bunch[s] >= 0 and (not clear or capsules.bunch[s] < capsules.tree_last_bunch[tree])
+    bunch = capsules.bunch[s]
+    may = bool(False)
+    if bunch >= 0 or capsules.branch[s] > 0:
+        clear = aabbs_disjoint(low, high, wood_boxes.low[tree], wood_boxes.high[tree])
+        may = not clear or (bunch >= 0 and bunch < capsules.tree_last_bunch[tree])
+    return may
 
 
 @wp.func
 def may_touch(s: int, t: int, capsules: Capsules, bodies: PlantBodies):
-    """Returns whether two capsules of one tree collide. Each pair of bunches is considered once."""
-    pair = not are_adjacent(capsules.body[s], capsules.body[t], bodies.parent)
-    if capsules.bunch[t] >= 0:
-        pair = pair and capsules.bunch[t] > capsules.bunch[s]
+    """Returns whether two capsules of one tree collide. Each pair of bunches or axes is considered once."""
+    pair = bool(True)
+    if capsules.bunch[s] < 0:
+        pair = capsules.bunch[t] < 0 and capsules.branch[t] < capsules.branch[s]
+    elif capsules.bunch[t] >= 0:
+        pair = capsules.bunch[t] > capsules.bunch[s]
+    if pair:
+        pair = not are_adjacent(capsules.body[s], capsules.body[t], bodies.parent)
     return pair
 
 

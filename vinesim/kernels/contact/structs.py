@@ -123,6 +123,8 @@ class Capsules:
     body: wp.array(dtype=wp.int32)
     bunch: wp.array(dtype=wp.int32)
     """[capsule] Index of the bunch that the capsule belongs to; -1 for wood."""
+    branch: wp.array(dtype=wp.int32)
+    """[capsule] Number of the unbranched axis of its tree; 0 for the main axis, -1 for bunches and peduncles."""
     level: wp.array(dtype=wp.int32)
     """[capsule] Level of detail of the tree at which the capsule exists. 0: always; 1: only while the berry clusters
     are locked to their bunches (coarse); 2: only while the clusters move (fine).

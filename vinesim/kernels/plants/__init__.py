@@ -38,8 +38,9 @@ Ties and air drag are forces at a point of a body that oppose its velocity. Impl
 this point: W = phi dt (phi dt k + c) for a spring of stiffness k with a damper c, and W = dt c for drag with the
 coefficient c.
 
-Gyroscopic and centrifugal terms are explicit; their relative error grows by about dt w^2 per second. So a drag of dt
-(w^2 - fast_rate^2) times its momentum slows a body that turns faster than ``fast_rate``, and the rates of a tree with a
+Gyroscopic and centrifugal terms are explicit; their relative error grows by about dt w^2 per second. So trees with a
+body above 3 rad/s take steps of second order (``fast_motion``), unless contacts press on them. In all other trees a
+drag of dt (w^2 - fast_rate^2) times its momentum slows a body that turns faster than ``fast_rate``, and the rates of a tree with a
 joint beyond ``max_rate`` are scaled down until its fastest joint has half of ``max_rate``.
 
 Signs and frames: all vectors are in world axes. Velocities and accelerations are (linear of the body's origin,
@@ -58,6 +59,6 @@ addition in place would be an atomic operation in a distant cache of the GPU.
 Files: ``structs`` (arguments), ``spatial`` (rotations, inertias), ``forces`` (springs, ties, drag), ``kinematics``,
 ``body_dynamics`` (one body and its joint), ``prediction`` (the three passes over one tree), ``eight_trees`` (the same
 over eight trees at once, on a CPU), ``lean_prediction`` (the same with little memory traffic, on a GPU), ``first_mode``
-(substeps), ``energy_budget``, ``impulse_response``, ``integration``, ``floating_components`` (cut-off parts),
+(substeps), ``fast_motion``, ``energy_budget``, ``impulse_response``, ``integration``, ``floating_components`` (cut-off parts),
 ``joint_wrench``, ``tree_checks``, ``gather_scatter`` (rows between host and device).
 """

@@ -18,7 +18,7 @@ from vinesim.kernels.plants.forces import (
     tie_force,
 )
 from vinesim.kernels.plants.spatial import cross_rows, half_rotation, point_mass_inertia, rotated_diagonal, symmetric
-from vinesim.kernels.plants.structs import SolverParameters
+from vinesim.kernels.plants.structs import SolverParameters, lever_time
 
 wp.set_module_options({"enable_backward": False})
 
@@ -44,7 +44,7 @@ def own_terms(
     that no tie holds, else 0. The weight of such a body causes no tension, and the drag of fast bodies does not slow
     its fall. fall: [m/s] velocity of that component's root.
     """
-    ahead = p.geometric_stiffness * (1.0 - phi) * p.dt
+    ahead = lever_time(p, phi)
     reach = p.geometric_stiffness * phi * phi * p.dt * p.dt
     velocity = wp.spatial_top(motion)
     omega = wp.spatial_bottom(motion)
@@ -74,7 +74,7 @@ def drag_terms(p: SolverParameters, phi: float, area: float, air: wp.vec3, motio
 
     air: [m/s] velocity of the air.
     """
-    ahead = p.geometric_stiffness * (1.0 - phi) * p.dt
+    ahead = lever_time(p, phi)
     reach = p.geometric_stiffness * phi * phi * p.dt * p.dt
     slip = wp.cross(wp.spatial_bottom(motion), com)
     wind = air - wp.spatial_top(motion) - slip
@@ -186,7 +186,7 @@ def terms_left(
     Du: wp.vec3,
 ):
     """Returns the J, H, M and bias that a subtree passes to its parent after its joint is eliminated."""
-    ahead = p.geometric_stiffness * (1.0 - phi) * p.dt
+    ahead = lever_time(p, phi)
     reach = p.geometric_stiffness * phi * phi * p.dt * p.dt
     J_left = metric * DJ  # = J - J D J without the cancellation; the same for H
     H_left = metric * DH

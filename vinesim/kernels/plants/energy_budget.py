@@ -261,7 +261,7 @@ def filter_rates(
     This is the articulated-body algorithm at rest: v' - v is the acceleration by the joint torques -c K v if c K is
     added to the inertia of the joints.
     """
-    unloaded = SolverParameters(1.0, p.fast_rate, p.max_rate, p.fault_rate, p.contact_steps, 0.0, p.gravity)
+    unloaded = SolverParameters(1.0, p.fast_rate, p.max_rate, p.fault_rate, p.contact_steps, 0.0, 0.0, p.gravity)
     first = model.tree_first[tree]
     size = model.tree_moving[tree]
     for k in range(first, first + size * model.pitch, model.pitch):

@@ -2,7 +2,8 @@
 the external forces.
 
 The integration of joints changes the momentum of a free tree by an error of about dt^2. So the root's pose and rate are
-corrected after the integration, until linear and angular momentum and the centre of mass are exact.
+corrected after the integration, until linear and angular momentum and the centre of mass are exact (angular momentum
+not in the first steps of a contact, see below).
 
 The component's centre of mass moves, and its root turns, at the mean of the rates before and after the step. A
 component with contacts moves at the rate after the step instead, as the contact solve assumes. With the mean rate it
@@ -209,6 +210,7 @@ def correct_floating_momentum(
     path = com + dt * (velocity + 0.5 / mass * (linear + goal_linear))
     if is_pressed and tree_phi[tree] == 1.0:
         path = com + dt * (velocity + goal_linear / mass)
+    if tree_phi[tree] == 1.0:  # like the joints beyond it: after a blow, rates change much in each step
         turned = exponential(dt * joints_out.joint_qd[root]) * wp.transform_get_rotation(bodies.body_q[root])
         joints_out.joint_q[root] = wp.normalize(turned)
 
@@ -218,7 +220,10 @@ def correct_floating_momentum(
     com_now = mass_com_now / mass
     angular_now = angular_now - wp.cross(com_now, linear_now)
     locked = locked - point_mass_inertia(mass, com_now)
-    rotation, turn = angular_correction(locked, angular_now, goal_angular, dt)
+    rotation = wp.quat_identity()
+    turn = wp.vec3()
+    if not (is_pressed and tree_phi[tree] == 1.0):
+        rotation, turn = angular_correction(locked, angular_now, goal_angular, dt)
     rate = wp.quat_rotate(rotation, joints_out.joint_qd[root]) + turn
     square = wp.length_sq(rate)
     if square > p.max_rate * p.max_rate:

@@ -9,6 +9,7 @@ import warp as wp
 
 from vinesim.kernels.plants.structs import (
     ArticulationModel,
+    BodyState,
     Factors,
     Prediction,
     ResponseColumns,
@@ -217,3 +218,68 @@ def apply_wrenches(
     if wp.tid() >= count[0]:
         return
     apply_tree_wrenches(trees[wp.tid()], dt, model, body_wrench, factors, work_out, scratch_out, prediction_out)
+
+
+@wp.kernel
+def respond_to_blows(
+    # model
+    model: ArticulationModel,
+    # in
+    count: wp.array(dtype=wp.int32),
+    blow_bodies: wp.array(dtype=wp.int32),
+    blow_points: wp.array(dtype=wp.vec3),
+    blow_axes: wp.array(dtype=wp.vec3),
+    bodies: BodyState,
+    factors: Factors,
+    # out
+    work_out: WrenchScratch,
+    scratch_out: Scratch,
+    response_out: wp.array2d(dtype=float),
+):
+    """One thread in all. Apply a unit impulse to a point of a body along an axis, blow by blow, and write the velocities
+    of all these points along their axes.
+
+    count: [1] number of blows. blow_bodies: [blow] body. blow_points: [blow] m, in the world. blow_axes: [blow] unit
+    vector. response_out: [blow, struck] 1/kg, velocity at ``blow`` by an impulse at ``struck``; 0 between trees.
+    work_out, scratch_out.Du: scratch.
+    """
+    for struck in range(count[0]):
+        body = blow_bodies[struck]
+        tree = model.body_tree[body]
+        first = model.tree_first[tree]
+        last = int(body)
+        for blow in range(count[0]):
+            if model.body_tree[blow_bodies[blow]] == tree:
+                last = wp.max(last, blow_bodies[blow])
+        for k in range(first, last + 1, model.pitch):
+            scratch_out.Du[k] = wp.vec3()
+            work_out.subtree_wrench[k] = wp.spatial_vector()
+        force = wp.vec3(blow_axes[struck])
+        moment = wp.cross(blow_points[struck] - wp.transform_get_translation(bodies.body_q[body]), force)
+        path = int(body)
+        while path >= 0:
+            scratch_out.Du[path] = factors.D[path] * moment
+            force = force - wp.transpose(factors.DH[path]) * moment
+            moment = moment - wp.transpose(factors.DJ[path]) * moment + wp.cross(factors.lever[path], force)
+            work_out.subtree_wrench[path] = wp.spatial_vector(force, moment)
+            path = model.body_parent[path]
+        for k in range(first, last + 1, model.pitch):
+            parent = model.body_parent[k]
+            above = wp.spatial_vector()
+            if parent >= 0:
+                above = work_out.added_acceleration[parent]
+            elif model.body_root[k] >= 0:
+                pushed = wp.spatial_top(work_out.subtree_wrench[k])
+                above = wp.spatial_vector(factors.root_inverse_mass[k] * pushed, wp.vec3())
+            alpha = wp.spatial_bottom(above)
+            a = wp.spatial_top(above) + wp.cross(alpha, factors.lever[k])
+            relative = scratch_out.Du[k] - factors.DJ[k] * alpha - factors.DH[k] * a
+            work_out.added_acceleration[k] = wp.spatial_vector(a, alpha + relative)
+        for blow in range(count[0]):
+            k = blow_bodies[blow]
+            response_out[blow, struck] = 0.0
+            if model.body_tree[k] == tree:
+                arm = blow_points[blow] - wp.transform_get_translation(bodies.body_q[k])
+                moved = work_out.added_acceleration[k]
+                velocity = wp.spatial_top(moved) + wp.cross(wp.spatial_bottom(moved), arm)
+                response_out[blow, struck] = wp.dot(blow_axes[blow], velocity)

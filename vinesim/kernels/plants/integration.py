@@ -36,6 +36,7 @@ def integrate(
     tree_awake: wp.array(dtype=wp.bool),
     tree_phi: wp.array(dtype=float),
     tree_steps: wp.array(dtype=wp.int32),
+    tree_moved: wp.array(dtype=wp.bool),
     joints: JointState,
     prediction: Prediction,
     # out
@@ -48,7 +49,9 @@ def integrate(
 
     trees: [thread] index of the tree; nothing happens unless tree_awake [tree]. tree_phi: [tree] phi (implicitness of
     the integrator, 0.5 trapezoidal to 1 backward Euler) that :func:`predict` used. tree_steps: [tree] number of
-    substeps of the step; a tree that is stopped in one substep takes no further substeps. tree_rate_out: [tree]
+    substeps of the step; a tree that is stopped in one substep takes no further substeps. tree_moved: [tree] whether
+    the joint rotations are those of the end of a whole step already (:mod:`vinesim.kernels.plants.fast_motion`).
+    tree_rate_out: [tree]
     sqrt(a^2 + b^2) of the fastest joint rate a [rad/s] and the fastest speed b [m/s] of a floating root; NaN or above
     ``p.fault_rate`` if the tree was stopped. tree_euler_steps_out: [tree] number of steps and substeps still to be
     taken with phi = 1; this kernel counts it down. joints_out: [body] rotations by the exponential map of the mean
@@ -64,6 +67,7 @@ def integrate(
     size = model.tree_moving[tree]
     pitch = model.pitch
     dt = p.dt / float(substeps)
+    is_moved = tree_moved[tree] and substeps == 1
     turning, falling = max_rate_and_speed(
         prediction.joint_qd_free,
         joints.joint_x,
@@ -109,7 +113,9 @@ def integrate(
                 joints_out.joint_xd[k] = prediction.joint_xd_free[k]
             mean = (1.0 - share) * rate_before + share * rate
             joints_out.joint_qd[k] = rate
-            joints_out.joint_q[k] = wp.normalize(exponential(dt * mean) * q)
+            if not is_moved:
+                q = wp.normalize(exponential(dt * mean) * q)
+            joints_out.joint_q[k] = q
         else:
             joints_out.joint_qd[k] = wp.vec3()
             joints_out.joint_q[k] = q

@@ -28,6 +28,7 @@ from vinesim.kernels.plants.structs import (
     Prediction,
     Scratch,
     SolverParameters,
+    lever_time,
     substep_parameters,
 )
 
@@ -177,7 +178,7 @@ def eliminate_joints(
     scratch_out: Scratch,
 ):
     """From the tips to the root of one tree: factor each joint's implicit inertia and pass the rest to the parent."""
-    ahead = p.geometric_stiffness * (1.0 - phi) * p.dt
+    ahead = lever_time(p, phi)
     reach = p.geometric_stiffness * phi * phi * p.dt * p.dt
     conservative = is_conservative(p, phi)
     first = model.tree_first[tree]

@@ -19,7 +19,15 @@ class SolverParameters:
     fault_rate: float  # [rad/s] a tree with a faster joint is not integrated
     contact_steps: int  # a larger count of backward Euler steps was not set by a contact
     geometric_stiffness: float  # 1: the implicit solve includes geometric stiffness; 0: it does not
+    euler_levers: float  # 1: levers of forces are those of backward Euler; 0: swings lose no energy at any phi
     gravity: wp.vec3  # [m/s^2]
+
+
+@wp.func
+def lever_time(p: SolverParameters, phi: float):
+    """Returns the time [s] after the start of the step at which forces act on levers: (1 - phi) dt, or phi dt with
+    ``p.euler_levers``; 0 without geometric stiffness."""
+    return p.geometric_stiffness * (1.0 - phi + p.euler_levers * (2.0 * phi - 1.0)) * p.dt
 
 
 @wp.func
@@ -32,6 +40,7 @@ def substep_parameters(p: SolverParameters, steps: int):
         p.fault_rate,
         p.contact_steps,
         p.geometric_stiffness,
+        p.euler_levers,
         p.gravity,
     )
 
@@ -127,6 +136,17 @@ class Prediction:
     joint_xd_free: wp.array(dtype=wp.vec3)  # [m/s]
     joint_qd_free: wp.array(dtype=wp.vec3)  # [rad/s]
     body_qd_free: wp.array(dtype=wp.spatial_vector)  # [m/s, rad/s]
+
+
+@wp.struct
+class FastScratch:
+    """Joints of fast trees at the start of the step, and after the step as a whole; see
+    :mod:`vinesim.kernels.plants.fast_motion`."""
+
+    start_joint_q: wp.array(dtype=wp.quat)  # [body]
+    start_joint_qd: wp.array(dtype=wp.vec3)  # [body] rad/s
+    coarse_joint_q: wp.array(dtype=wp.quat)  # [body]
+    coarse_joint_qd: wp.array(dtype=wp.vec3)  # [body] rad/s
 
 
 @wp.struct

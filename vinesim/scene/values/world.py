@@ -82,6 +82,10 @@ class Contact:
     """[3] N on the rigid body, world axes; the opposite force acts on the plant."""
     distance: float
     """Gap [m], negative if the bodies overlap."""
+    peak: float = 0.0
+    """[N] Largest size of the force within the tick, as a mean over 1.25 ms. It is larger than the size of
+    :attr:`force`, the mean over the tick, in the tick in which two bodies hit each other. 0 for a hand that holds a
+    plant, and for contacts that a robot's sensor process reports."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
