@@ -49,6 +49,7 @@ from vinesim.kernels.plants.kinematics import forward_kinematics
 from vinesim.kernels.plants.lean_prediction import predict_lean
 from vinesim.kernels.plants.prediction import predict
 from vinesim.kernels.plants.tree_checks import find_fastest
+from vinesim.kernels.plants.wood_stress import WoodStrength, find_stress
 from vinesim.plants.contact_loads import ContactLoads
 from vinesim.plants.device_buffers import DeviceBuffers
 from vinesim.plants.ties import RootRests, TieTable, turning_damping
@@ -1577,6 +1578,30 @@ class KernelLaunches:
             buffers.reach(carried, wp.spatial_vector, "joint_wrench"),
         )
         return JointWrenches(places, count, carried, launch)
+
+    def wood_stress(self, wood: WoodStrength, capacity: wp.array, stress: wp.array, largest: wp.array) -> KernelGraph:
+        """Returns the launch that finds the stress in the wood of the trees of the last step. Arguments: see
+        :func:`vinesim.kernels.plants.wood_stress.find_stress`."""
+        return self.graph(
+            self.launch(
+                find_stress,
+                self.parameters,
+                self._model,
+                wood,
+                capacity,
+                self.count(_STEPPING),
+                "stepping",
+                "phi_used",
+                "tree_steps",
+                self._forces,
+                self._bodies,
+                "body_acceleration",
+                self.fill(structs.JointState),
+                "subtree_wrench",
+                stress,
+                largest,
+            )
+        )
 
 
 # Launches over the awake trees: in groups of one topology on a CPU, captured into a graph on a GPU.

@@ -95,6 +95,7 @@ class Peduncle(_Part, frozen=True, kw_only=True):
     density: Annotated[Number, "kg/m^3"]
     damping: Annotated[Number, "s"]
     pull: Annotated[Range, "N"]
+    """Pulling forces at which peduncles break: 5 % are weaker, 5 % are stronger; see :mod:`vinesim.scene.strength`."""
     bend_strength: Annotated[Number, "Pa"]
     slant: Annotated[Range, "1"] = Range((0.1, 1.2), "1", "GUESSED", "stalks lead a bunch out beside what it hangs at")
     """Least and greatest tangent of the angle between the upper half of the stalk and the vertical, where
@@ -238,6 +239,8 @@ class Berry(_Part, frozen=True, kw_only=True):
     compactness: Annotated[Number | None, "1"] = None
     """Density of the bunch, note of OIV descriptor 204: 1 very loose, 9 very dense."""
     peduncle_length: Annotated[Range | None, "m"] = None
+    peduncle_pull: Annotated[Range | None, "N"] = None
+    """As ``Peduncle.pull``."""
     leaf_area: Annotated[Number | None, "m^2"] = None
     sinus_depth: Annotated[Number | None, "1"] = None
     """Depth of the leaf's upper lateral sinuses, note of OIV descriptor 094: 1 very shallow, 9 very deep."""

@@ -193,7 +193,8 @@ def _assemble_model(
     model.bunch_berries[:] = fruit["count"]
     for name in ("length", "radius", "seed", "variety", "pull"):
         getattr(model, f"bunch_{name}")[:] = fruit[name]
-    model.bunch_bend[:] = parameters.peduncle.bend_strength.value * np.pi / 4.0 * portable_math.power(fruit["thick"], 3)
+    strength = parameters.peduncle.bend_strength.value * fruit["strong"]
+    model.bunch_bend[:] = strength * np.pi / 4.0 * portable_math.power(fruit["thick"], 3)
     model.bunch_cluster[:] = np.stack([number[:, cluster_slots(k).start] for k in range(MAX_BUNCHES)], 1)[
         shoots.has_bunch
     ]

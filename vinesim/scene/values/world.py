@@ -92,7 +92,8 @@ class Detachment:
     bunch: int
     """Index of the bunch, -1 for a cane."""
     cause: str
-    """``"pull"`` (too large force), ``"bend"`` (too large moment), ``"blade"`` (a cutter) or ``"command"``."""
+    """``"pull"``, ``"bend"`` or ``"twist"`` (the load that used most of the strength), ``"blade"`` (a cutter) or
+    ``"command"``."""
     actor: str
     """Name of the actor who caused the detachment; empty if unknown."""
     force: np.ndarray
@@ -104,3 +105,9 @@ class Detachment:
     """
     at: float = 0.0
     """[m] Distance of the cut from the origin of ``segment``."""
+    time: float = 0.0
+    """[s] Simulated time of the detachment. A break falls within a step."""
+    place: float = 0.0
+    """[m] Distance of the cut or break from the base of the tree, along the wood."""
+    point: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """[m] Place of the cut or break in the world."""
