@@ -1,13 +1,18 @@
-"""Wood that gives: peduncles in tension, bending and twist, at both ends and for seconds of load."""
+"""Wood that gives: peduncles in tension, bending and twist, at both ends and for seconds of load. Canes that keep a
+set, crack and break, against beam theory."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 from scipy.stats import kstest, weibull_min
 
+from vinesim import Simulation
 from vinesim.core import frames
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
+from vinesim.scene.cane import CaneBuilder
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
@@ -100,3 +105,129 @@ def test_the_event_names_cause_and_end(rate, cause, end):
 def test_a_stalk_that_is_pushed_does_not_break_by_pull():
     broken = load_until_broken(stalks(np.array([20.0]), 1e3), 0.01, np.array([0.0, 0.0, 30.0, 0, 0, 0]), 1.0)
     assert broken == []
+
+
+# Canes.
+
+E_WOOD = 5.9e9
+STRENGTH = 80e6
+
+
+def wood(**numbers) -> CaneBuilder:
+    """A cane of 0.3 m and 10 mm, level, that cracks at 80 MPa unless other numbers are given."""
+    given = {"length": 0.3, "radius": 0.005, "youngs_modulus": E_WOOD, "strength": STRENGTH, "segments": 12}
+    return CaneBuilder(density=900.0, damping_ratio=0.3, **(given | numbers))
+
+
+def push_tip(model: Model, dt: float, rate: float, seconds: float, largest: float = np.inf) -> Simulation:
+    """Push the tip of a level cane down, by a force that grows by ``rate`` [N/s] up to ``largest``, without weight,
+    until the cane cracks."""
+    simulation = Simulation(model, parameters=PhysicsParameters(dt=dt, gravity=0.0, sleep=False))
+    for _ in range(round(seconds / dt)):
+        force = min(rate * simulation.time, largest)
+        simulation.apply_wrench(simulation.tip_body(), (0.0, 0.0, -force), at=simulation.tip())
+        simulation.step()
+        if simulation.breakages:
+            break
+    return simulation
+
+
+def elastica(moment: float, length: float, stiffness: float) -> tuple[float, float]:
+    """Force [N] across the tip of a clamped level beam with this moment at the clamp, and the tip's angle [rad]."""
+
+    def bend(force: float) -> tuple[float, float]:
+        # theta' = M / EI, M' = -F cos(theta)
+        made = solve_ivp(
+            lambda _, y: [y[1] / stiffness, -force * np.cos(y[0])], (0.0, length), [0.0, moment], rtol=1e-9, atol=1e-12
+        )
+        return made.y[1, -1], made.y[0, -1]
+
+    force = brentq(lambda f: bend(f)[0], 0.5 * moment / length, 3.0 * moment / length)
+    return force, bend(force)[1]
+
+
+@pytest.mark.parametrize("dt", [0.002, 0.01])
+@pytest.mark.parametrize("length", [0.3, 0.6])
+def test_a_cane_cracks_at_the_force_and_angle_of_beam_theory(dt, length):
+    section = np.pi * 0.005**3 / 4.0
+    force, angle = elastica(STRENGTH * section, length, E_WOOD * section * 0.005)
+    simulation = push_tip(wood(length=length).build(), dt, 0.7 * force, 3.0)
+    (crack,) = simulation.breakages
+    assert (crack.kind, crack.cause, crack.body, crack.place) == ("crack", "bend", 0, 0.0)
+    assert np.linalg.norm(crack.moment) == pytest.approx(STRENGTH * section, rel=0.03)
+    assert np.linalg.norm(crack.force) == pytest.approx(force, rel=0.05)
+    pose = simulation.body_pose(simulation.tip_body())
+    tip = frames.rotate(pose[3:], np.array([1.0, 0.0, 0.0]))
+    assert np.arcsin(-tip[2]) == pytest.approx(angle, rel=0.05)
+
+
+def test_wood_bent_past_its_yield_keeps_a_set_and_then_springs():
+    """Of the moment above the yield the law leaves a known set, which does not grow when the same load comes again."""
+    model = wood(yield_strength=50e6).build()
+    simulation = Simulation(model, parameters=PhysicsParameters(gravity=0.0, sleep=False))
+    law = simulation.physics.detachment_monitor.wood.law
+    largest = 0.85 * float(law.breaks[0]) / 0.3
+    flows = []
+    for _ in range(2):
+        for step in range(300):
+            force = largest * min(step / 200.0, 1.0) if step < 250 else 0.0
+            simulation.apply_wrench(simulation.tip_body(), (0.0, 0.0, -force), at=simulation.tip())
+            simulation.step()
+            assert simulation.breakages == simulation.detachments == ()
+            if step == 249:
+                moment = largest * simulation.tip()[0]
+        flows.append(simulation.state.joint_flow.copy())
+    simulation.step(300)
+    expected = (moment - law.yields[0]) * 0.6 / 0.4 / model.joint_stiffness[0, 2]
+    assert flows[0][0] == pytest.approx(expected, rel=0.1)
+    np.testing.assert_allclose(flows[1], flows[0], rtol=0.02, atol=1e-5)
+    kept = frames.log(simulation.state.joint_set.astype(float))
+    np.testing.assert_allclose(np.linalg.norm(kept, axis=1), flows[1], rtol=0.02, atol=1e-5)
+    tip = frames.rotate(simulation.body_pose(11)[3:], np.array([1.0, 0.0, 0.0]))
+    assert np.arcsin(-tip[2]) == pytest.approx(flows[1].sum(), rel=0.03)
+
+
+@pytest.mark.parametrize("speed", [0.1, 0.3])
+def test_the_work_of_a_break_is_accounted_for(speed):
+    """A cane is bent by a tie that moves down until the cane parts: work of the tie = elastic + kinetic + set + crack +
+    damping; and the crack takes at least toughness times cross-section."""
+    model = wood(yield_strength=50e6, toughness=5e3).build()
+    simulation = Simulation(model, parameters=PhysicsParameters(dt=0.002, gravity=0.0, sleep=False))
+    simulation.wake(0)
+    plants = simulation.physics.plants
+    monitor = simulation.physics.detachment_monitor.wood
+    tip = simulation.tip_body()
+    tie = plants.add_tie(tip, np.array([float(model.body_length[tip]), 0.0, 0.0]), 5e3, 1.0)
+    work = 0.0
+    start = plants.tie_anchor[tie].astype(float)
+    for step in range(round(0.35 / speed / 0.002)):
+        stretch = simulation.tip() - plants.tie_anchor[tie]
+        if simulation.detachments:
+            break
+        at = start + np.array([-0.3, 0.0, -1.0]) * speed * 0.002 * (step + 1)
+        work -= float(5e3 * stretch @ (at - plants.tie_anchor[tie]))
+        plants.tie_anchor[tie] = at
+        simulation.step()
+    (broken,) = simulation.detachments
+    assert broken.cause == "bend"
+    elastic = 0.5 * 5e3 * float(stretch @ stretch)
+    gained = simulation.energy().total + elastic + monitor.work.sum()
+    assert monitor.work[:, 1].sum() > 5e3 * np.pi * 0.005**2 * 0.95
+    assert gained == pytest.approx(work, rel=0.06)
+    assert gained < work * 1.01
+
+
+def test_a_side_shoot_tears_off_at_its_base():
+    tree = wood().tree()
+    thin = RodMaterial(1e9, 950.0, 0.02, strength=45e6, yield_strength=30e6, toughness=5e3)
+    side = tree.add_rod(5, 0.2, (0.002, 0.002), thin, 6, rest=frames.exp(np.array([0.0, 0.0, 0.5 * np.pi])))
+    simulation = Simulation(assemble([tree]), parameters=PhysicsParameters(gravity=0.0, sleep=False))
+    found = []
+    for _ in range(400):
+        simulation.apply_wrench(side[-1], (0.0, 0.0, -3.0 * simulation.time), at=simulation.body_pose(side[-1])[:3])
+        simulation.step()
+        found += simulation.detachments
+        if found:
+            break
+    assert [one.body for one in found] == [side[0]]
+    assert found[0].place == pytest.approx(6 * 0.025)

@@ -1,4 +1,4 @@
-"""Wood that gives: peduncles that break off at either end.
+"""Wood that gives: peduncles that break off at either end, canes that keep a set, crack and break.
 
 A kernel finds the stress in the wood of all awake trees (:mod:`vinesim.kernels.plants.wood_stress`). The rest of this
 module deals with the few pieces of wood whose stress is near their strength. Only the client that owns a tree lets its
@@ -19,16 +19,20 @@ from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.scene.strength import BendingLaw
 
 PULL = "pull"
 BEND = "bend"
 TWIST = "twist"
 """Causes of a break: the load that uses most of the strength."""
+PLASTIC = 0
+FRACTURE = 1
+"""Columns of :attr:`WoodMonitor.work`."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Overload:
-    """A piece of wood that has broken in the last step, before it is taken off its tree."""
+    """A piece of wood that has broken or cracked in the last step. What has broken is still on its tree."""
 
     body: int
     """The body beyond the joint in which the wood broke."""
@@ -38,12 +42,20 @@ class Overload:
     """:data:`PULL`, :data:`BEND` or :data:`TWIST`."""
     wrench: np.ndarray
     """[6] force [N] of the tree on the body when it broke, and moment [N m] about the joint, world axes."""
-    late: float
+    late: float = 0.0
     """[s] Time from the break to the end of the step."""
+    is_crack: bool = False
+    """Whether the wood has only cracked."""
 
 
 class WoodMonitor:
-    """Finds the wood of awake trees that breaks under its load.
+    """Finds the wood of awake trees that gives under its load.
+
+    A joint of a cane whose elastic moment passes its capacity (:class:`vinesim.scene.strength.BendingLaw`) keeps a set:
+    its rest pose turns until the moment is the capacity, and its present pose stays. A joint that is about to pass its
+    capacity gives in advance, by the share phi (implicitness of the integrator) of what it will give in the next step.
+    So the moment with which that step is solved is the capacity: a fast hand does not feel more than the wood bears.
+    A brittle joint breaks in the step in which its moment is nearest to its strength.
 
     A peduncle breaks at the end where its stress is larger, after it has been overloaded for ``detachment_duration``
     seconds without a pause. Time under load is counted within steps, from the moment at which the stress passed the
@@ -69,7 +81,18 @@ class WoodMonitor:
         self._used_before = np.zeros(bunches)
         self._wrenches: dict[int, tuple[int, int, np.ndarray]] = {}
         """Tick, body and wrench of the overloaded end of each overloaded bunch in the last step."""
+        self.law = BendingLaw.of(
+            model.body_radius[:, 0],
+            model.joint_stiffness[:, 2],
+            model.body_strength,
+            model.body_yield_strength,
+            model.body_toughness,
+        )
+        """[body] How the joints of canes give."""
+        self.work = np.zeros((len(model.body_mass), 2))
+        """[body, 2] J, work that the wood at each joint has taken up so far: for its set, and for its crack."""
         self._bind()
+        self.read_state()
 
     def _bind(self) -> None:
         plants = self.plants
@@ -77,6 +100,8 @@ class WoodMonitor:
         count = len(model.body_mass)
         pull = np.full(count, np.inf, np.float32)
         bend = np.ones(count, np.float32)
+        strong = model.body_strength > 0.0
+        pull[strong] = (model.body_strength * np.pi * model.body_radius[:, 0] ** 2)[strong]
         for end in self._ends.T:
             pull[end] = model.bunch_pull
             bend[end] = model.bunch_bend
@@ -101,15 +126,74 @@ class WoodMonitor:
             buffers.reach(self._largest, wp.float32, "largest_stress"),
         )
 
+    def read_state(self, bodies: np.ndarray | None = None) -> None:
+        """Read from the state how far the wood of ``bodies`` [k] (default: all) has given."""
+        bodies = np.arange(len(self._kind)) if bodies is None else bodies
+        bodies = bodies[self._kind[bodies] == int(kernels.CANE)]
+        capacity = self.law[bodies].capacity(self.plants.state.joint_flow[bodies])
+        self._capacity[self.plants.buffers.slots[bodies]] = np.maximum(capacity, 1e-6)
+
     def update(self) -> list[Overload]:
-        """Find the wood that has broken in the last step, sorted by body. Call it once after each step."""
+        """Let wood give, and find the wood that has broken or cracked in the last step: peduncles, then canes, each
+        sorted by number. Call it once after each step."""
         plants = self.plants
         if len(plants.awake) == 0:
             return []
         self._largest[:] = 0.0
         self._find(len(plants.awake))
         plants.buffers.synchronize()
-        return self._break_stalks() if self._largest[0] >= 1.0 or self._load_time.any() else []
+        found = self._break_stalks() if self._largest[0] >= 1.0 or self._load_time.any() else []
+        if self._largest[1] >= 1.0:
+            found += self._bend_canes()
+        return found
+
+    def _bend_canes(self) -> list[Overload]:
+        """Let canes give whose moment passes their capacity, or will pass it in the next step. Returns those that crack
+        or break."""
+        plants = self.plants
+        model = plants.model
+        state = plants.state
+        slots = plants.buffers.slots
+        tree = model.body_tree
+        live = (self._kind == int(kernels.CANE)) & state.tree_awake[tree] & ~state.body_cut & ~self._is_remote[tree]
+        bodies = np.flatnonzero(live & (self._stress.max(1)[slots] >= self._capacity[slots])).astype(np.int32)
+        if len(bodies) == 0:
+            return []
+        moment, ahead = self._stress[slots[bodies]].T.astype(float)
+        further = np.maximum(ahead - moment, 0.0)
+        turn = frames.log(whole := state.joint_q[bodies].astype(float))
+        roots = model.body_parent[bodies] < 0
+        turn[roots] -= plants.root_rests.turn[tree[bodies[roots]]]
+        angle = np.maximum(np.linalg.norm(turn, axis=1), 1e-9)
+        stiffness = np.maximum(moment / angle, 1e-9)
+        law = self.law[bodies]
+        flow = state.joint_flow[bodies].astype(float)
+        end = (law.hardening + law.cracking) * (1.0 - 1e-9)
+        after = law.give(flow, moment, stiffness)
+        # the share of the next step's flow at which its equations have the moment that the law allows
+        expected = law.give(after, moment - stiffness * (after - flow) + further, stiffness)
+        phi = plants.phi_used[tree[bodies]]
+        snaps = (after < end) & (expected >= end) & (2.0 * (law.capacity(after) - moment) < phi * further)
+        after = np.where(expected < end, after + phi * (expected - after), np.where(snaps, expected, after))
+        given = np.minimum(after - flow, angle)
+        breaks = after >= end
+        cracks = (after > law.hardening) & (flow <= law.hardening)
+        brittle = np.maximum(after - np.maximum(flow, law.hardening), 0.0) / np.maximum(after - flow, 1e-30)
+        lost = (moment - 0.5 * stiffness * given) * given
+        self.work[bodies, PLASTIC] += np.where(breaks, 0.0, (1.0 - brittle) * lost)
+        self.work[bodies, FRACTURE] += np.where(breaks, 0.5 * moment * angle, brittle * lost)
+        events = np.flatnonzero(breaks | cracks)
+        wrenches = plants.joint_wrench(bodies[events]).astype(float) if len(events) else np.zeros((0, 6))
+        state.joint_flow[bodies] = after
+        self._stress[slots[bodies], 0] = moment - stiffness * given
+        turned = frames.exp(frames.log(whole) - (given / angle)[:, None] * turn)
+        part = frames.multiply(whole, frames.conjugate(turned))
+        plants.set_set(bodies, frames.multiply(state.joint_set[bodies].astype(float), part))
+        self.read_state(bodies)
+        return [
+            Overload(int(bodies[i]), -1, self._cause(int(bodies[i]), wrench), wrench, is_crack=not breaks[i])
+            for i, wrench in zip(events.tolist(), wrenches, strict=True)
+        ]
 
     def forget(self, bunch: int) -> None:
         """Forget the load on the peduncle of a bunch that was picked."""
@@ -142,20 +226,26 @@ class WoodMonitor:
                 tick, same, old = known.get(bunch, (-1, -1, wrench))
                 if (tick, same) == (plants.tick - 1, body):
                     wrench = wrench + (old - wrench) * min(late / plants.dt, 1.0)
-                found.append(Overload(body, bunch, self._cause(bunch, body, wrench), wrench, late))
+                found.append(Overload(body, bunch, self._cause(body, wrench, bunch), wrench, late))
         return found
 
-    def _cause(self, bunch: int, body: int, wrench: np.ndarray) -> str:
-        """Returns the load that uses most of the strength of a peduncle at the joint of ``body``."""
+    def _cause(self, body: int, wrench: np.ndarray, bunch: int = -1) -> str:
+        """Returns the load that uses most of the strength of a peduncle (of ``bunch``) or cane at the joint of
+        ``body``."""
         model = self.plants.model
-        wood = body if model.body_organ[body] == int(Organ.PEDUNCLE) else int(model.body_parent[body])
+        wood = int(model.body_parent[body]) if model.body_organ[body] == int(Organ.BUNCH) else body
+        if bunch >= 0:
+            pull = float(model.bunch_pull[bunch])
+            bend = float(model.bunch_bend[bunch])
+        else:
+            pull = float(model.body_strength[body] * np.pi * model.body_radius[body, 0] ** 2)
+            bend = float(self.law.breaks[body])
         pose = self.plants.state.body_q[max(wood, 0)].astype(float)
         axis = frames.rotate(pose[3:], np.array([1.0, 0.0, 0.0]))
         twist = float(wrench[3:] @ axis)
         bending = float(np.linalg.norm(wrench[3:] - twist * axis))
-        bend = float(model.bunch_bend[bunch])
         shares = {
-            PULL: -float(wrench[:3] @ axis) / float(model.bunch_pull[bunch]),
+            PULL: -float(wrench[:3] @ axis) / pull,
             BEND: bending / bend,
             TWIST: 0.5 * math.sqrt(3.0) * abs(twist) / bend,
         }
@@ -177,6 +267,7 @@ def wood_kinds(model: Model, ends: np.ndarray) -> np.ndarray:
     """Returns for each body what the wood at its joint is [body] int32, as a number of
     :mod:`vinesim.kernels.plants.wood_stress`. ``ends``: result of :func:`stalk_ends`."""
     kind = np.zeros(len(model.body_mass), np.int32)
+    kind[(model.body_organ == int(Organ.CANE)) & (model.body_strength > 0.0)] = int(kernels.CANE)
     kind[ends[:, 0]] = int(kernels.STALK_BASE)
     kind[ends[:, 1]] = int(kernels.STALK_END)
     alone = model.body_parent[model.bunch_body] < 0  # tension is measured along the bunch itself

@@ -15,14 +15,14 @@ import numpy as np
 from vinesim.contact.contact_solver import ContactSolver
 from vinesim.core import frames
 from vinesim.core.errors import checked_index
-from vinesim.interaction.breaking import WoodMonitor, distance_from_base
+from vinesim.interaction.breaking import Overload, WoodMonitor, distance_from_base
 from vinesim.interaction.stalk import cut_place, leave_stump, model_pieces, stalk_below, with_settled_stalk, with_stalk
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.rigid.free_bunch import FreeBunch
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene.ids import Organ
 from vinesim.scene.physics_parameters import PhysicsParameters
-from vinesim.scene.values import Contact, Detachment
+from vinesim.scene.values import Breakage, Contact, Detachment
 
 STUB_MASS = 1e-3
 """Mass of the stub that stays on the tree in place of a bunch [kg]."""
@@ -82,6 +82,9 @@ class DetachmentMonitor:
         self._wood = np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE))
         self.wood = WoodMonitor(plants, contact_solver.remote_trees, parameters)
         """Finds the wood that breaks under its load."""
+        self.breakages: tuple[Breakage, ...] = ()
+        """What has given without parting in the last step."""
+        self._breakages: list[Breakage] = []
         self._detachments: list[Detachment] = []
 
     # ------------------------------------------------------------------ the tick
@@ -93,6 +96,7 @@ class DetachmentMonitor:
             self._detach_overloaded()
         if any(blade.closing for blade in self.blades):
             self._cut_with_blades()
+        self.breakages, self._breakages = tuple(self._breakages), []
         taken = tuple(sorted(self._detachments, key=lambda parting: parting.body))
         self._detachments = []
         return taken
@@ -100,10 +104,40 @@ class DetachmentMonitor:
     def _detach_overloaded(self) -> None:
         """Detach what has broken under its load, on trees that this client controls."""
         for broken in self.wood.update():
-            actor = self._hardest_pressing_actor(broken.bunch)
+            if broken.bunch < 0:
+                self._part_cane(broken)
+                continue
+            actor = self._hardest_pressing_actor(self._bunch_of == broken.bunch)
             at_bunch = broken.body == self.plants.model.bunch_body[broken.bunch]
             place = None if at_bunch else (broken.body, cut_place(self.plants.model, broken.body, 0.0))
             self._pick(broken.bunch, broken.cause, actor, broken.wrench, place, broken.late)
+
+    def _part_cane(self, broken: Overload) -> None:
+        """Let a broken cane part at its joint, or report a crack."""
+        plants = self.plants
+        model = plants.model
+        body = broken.body
+        actor = self._hardest_pressing_actor(model.body_tree == model.body_tree[body])
+        if not broken.is_crack:
+            if not plants.state.body_cut[body]:
+                self._cut_joint(body, broken.cause, actor, broken.wrench)
+            return
+        self._breakages.append(
+            Breakage(
+                "crack",
+                broken.cause,
+                plants.tick,
+                plants.tick * plants.dt - broken.late,
+                int(model.body_tree[body]),
+                body,
+                -1,
+                actor,
+                broken.wrench[:3],
+                broken.wrench[3:],
+                distance_from_base(model, body),
+                tuple(plants.state.body_q[body, :3].astype(float).tolist()),
+            )
+        )
 
     def _cut_with_blades(self) -> None:
         """Cut the wood in the mouths of closing blades."""
@@ -306,7 +340,11 @@ class DetachmentMonitor:
             return
         if plants.state.body_cut[body]:
             raise ValueError(f"body {body} was cut already")
-        carried = plants.joint_wrench(np.array([body]))[0]
+        self._cut_joint(body, cause, actor, plants.joint_wrench(np.array([body]))[0])
+
+    def _cut_joint(self, body: int, cause: str, actor: str, carried: np.ndarray) -> None:
+        """Part a cane at the joint between ``body`` and its parent."""
+        plants = self.plants
         tree = int(plants.model.body_tree[body])
         plants.wake(tree)
         plants.forward_kinematics(np.array([tree]))
@@ -378,11 +416,11 @@ class DetachmentMonitor:
             )
         )
 
-    def _hardest_pressing_actor(self, bunch: int) -> str:
-        """Returns the name of the actor that presses hardest on a bunch; empty if no actor does."""
+    def _hardest_pressing_actor(self, bodies: np.ndarray) -> str:
+        """Returns the name of the actor that presses hardest on ``bodies`` [body] bool; empty if no actor does."""
         pushes: dict[str, float] = {}
         for contact in self.contact_solver.contacts + self.hand_contacts:
-            if self._bunch_of[contact.body] == bunch and contact.actor not in ("world", "plants"):
+            if bodies[contact.body] and contact.actor not in ("world", "plants"):
                 pushes[contact.actor] = pushes.get(contact.actor, 0.0) + float(np.linalg.norm(contact.force))
         return max(sorted(pushes), key=lambda actor: pushes[actor], default="")
 

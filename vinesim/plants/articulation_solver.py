@@ -258,6 +258,8 @@ class ArticulationSolver:
         self._root = np.full(bodies, -1, np.int32)
         self._offset = model.body_offset.copy()
         self._rest = model.body_rest.copy()
+        if len(bent := np.flatnonzero((state.joint_set[:, :3] != 0.0).any(1))):
+            self._rest[bent] = frames.normalize(frames.multiply(model.body_rest[bent], state.joint_set[bent]))
         self._falls = np.zeros(bodies, np.bool_)  # whether no tie holds the body's floating component
         self._floating, self._divided_floating = (np.zeros(bodies, np.int32) for _ in range(2))
         self._falling_roots = np.zeros(0, np.int32)
@@ -471,6 +473,22 @@ class ArticulationSolver:
         if not 0.0 < mass < math.inf:
             raise ValueError(f"body {body}: mass {mass} kg; leave a stub of a gram")
         self.berry_clusters.set_mass(body, mass)
+
+    def set_set(self, bodies: np.ndarray, kept: np.ndarray) -> None:
+        """Change the set (``State.joint_set``) of ``bodies`` [k] to ``kept`` [k, 4] xyzw. Their poses and velocities do
+        not change, only what their springs pull towards.
+
+        A body that has been cut off has no joint, and keeps no set.
+        """
+        state = self.state
+        bodies, kept = bodies[held := ~state.body_cut[bodies]], frames.normalize(np.asarray(kept, float)[held])
+        before = state.joint_set[bodies].astype(float)
+        turn = frames.multiply(frames.conjugate(kept), before)
+        state.joint_set[bodies] = kept
+        self._rest[bodies] = frames.normalize(frames.multiply(self.model.body_rest[bodies].astype(float), kept))
+        state.joint_q[bodies] = frames.normalize(frames.multiply(turn, state.joint_q[bodies].astype(float)))
+        state.joint_qd[bodies] = frames.rotate(turn, state.joint_qd[bodies].astype(float))
+        self.buffers.upload(["body_rest"])
 
     def set_inertia(self, body: int, mass: float, com: np.ndarray, inertia: np.ndarray) -> None:
         """Set mass [kg], centre of mass [3] m and moments of inertia about it [3] kg m^2 of one piece of wood, in its

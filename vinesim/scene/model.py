@@ -66,6 +66,13 @@ class Model(StructOfArrays):
     """Radius at the origin and at the tip."""
     body_drag: np.ndarray = array("body", unit="m^2")
     """Drag area Cd A of leaves and wood; the wind force acts at the centre of mass."""
+    body_strength: np.ndarray = array("body", unit="Pa")
+    """Modulus of rupture of the wood of a cane: stress in the outermost fibre at the joint at which it cracks. 0: it
+    never breaks."""
+    body_yield_strength: np.ndarray = array("body", unit="Pa")
+    """Stress in the outermost fibre above which the wood keeps a set; 0: it keeps none before it cracks."""
+    body_toughness: np.ndarray = array("body", unit="J/m^2")
+    """Work that breaks the wood through, for each unit of its cross-section, after it has cracked."""
     joint_stiffness: np.ndarray = array("body", 3, unit="N m/rad")
     """Joint stiffness about the joint frame's axes: torsion, bending, bending."""
     joint_damping: np.ndarray = array("body", 3, unit="N m s/rad")

@@ -76,6 +76,13 @@ class Cane(_Part, frozen=True, kw_only=True):
     lateral_length: Annotated[Range, "m"]
     lateral_diameter: Annotated[Number, "m"]
     drag: Annotated[Number, "1"]
+    woody_strength: Annotated[Number, "Pa"] = Number(90e6, "Pa", "GUESSED", "as in vine.toml")
+    """Modulus of rupture of the woody base; of green wood: ``green_strength``. See ``Model.body_strength``."""
+    green_strength: Annotated[Number, "Pa"] = Number(45e6, "Pa", "GUESSED", "as in vine.toml")
+    yield_share: Annotated[Number, "1"] = Number(0.65, "1", "GUESSED", "as in vine.toml")
+    """Ratio of the stress above which wood keeps a set to its modulus of rupture."""
+    toughness: Annotated[Number, "J/m^2"] = Number(1e4, "J/m^2", "GUESSED", "as in vine.toml")
+    """Work that breaks cracked wood through, for each unit of its cross-section."""
     lateral_place: Annotated[Range, "1"] = Range((6 / 14, 11 / 14), "1", "GUESSED", "as in vine.toml")
     """Distance of a side shoot from the base of its shoot, as a share of the shoot's length."""
     lean_along: Annotated[Number, "1"] = Number(0.12, "1", "GUESSED", "shoots of a hedge that was tucked in carefully")

@@ -48,14 +48,14 @@ def used_strength(tension: float, bending: float, twist: float, pull: float, ben
 
 
 @wp.func
-def spring_moment(stiffness: wp.vec3, q: wp.quat, rate: wp.vec3):
-    """Returns the elastic moment [N m] in the joint of a cane as the moment of pure bending that uses the same strength:
+def spring_moment(stiffness: wp.vec3, q: wp.quat, further: wp.vec3):
+    """Returns the elastic moment [N m] in a cane's joint as the moment of pure bending that uses the same strength:
     sqrt(M^2 + 3/4 T^2).
 
-    rate: [rad] further rotation of the joint, in joint axes.
+    further: [rad] rotation that is added to q, in joint axes.
     """
     s, _excess, v = middle_axes_scale(q)
-    torque = wp.cw_mul(stiffness, 2.0 * s * v + rate)
+    torque = wp.cw_mul(stiffness, 2.0 * s * v + further)
     return wp.sqrt(torque[1] * torque[1] + torque[2] * torque[2] + 0.75 * torque[0] * torque[0])
 
 
@@ -85,7 +85,8 @@ def find_stress(
     bodies: motion at the start of the step. joints: joints at its end. capacity: [body] N m, moment that a cane's joint
     bears now. carried_out: [body] scratch: wrench in each joint, about the body's origin. stress_out: [body] for a
     peduncle the used share of its strength and 0; for a cane its elastic moment [N m] now and, if the joint keeps its
-    rate, at the end of the next step; both are raised for the tension in the cane. largest_out: [2] largest used share
+    rate under a contact, at the end of the next step; both are raised for the tension in the cane. It is also read: the
+    moment before the step. largest_out: [2] largest used share
     [1] of a peduncle, and largest moment of a cane over its capacity [1].
     """
     if wp.tid() >= count[0]:
@@ -93,7 +94,9 @@ def find_stress(
     tree = trees[wp.tid()]
     first = model.tree_first[tree]
     size = model.tree_moving[tree]
+    is_pushed = bool(False)
     for k in range(first, first + size * model.pitch, model.pitch):
+        is_pushed = is_pushed or wp.length_sq(forces.body_wrench[k]) > 0.0
         carried_out[k] = own_wrench(k, tree, p, model, tree_phi, tree_steps, forces, bodies, body_acceleration)
     in_stalks = float(0.0)
     in_canes = float(0.0)
@@ -115,9 +118,16 @@ def find_stress(
             tension = -wp.dot(force, axis)
             if kind == CANE:
                 rest = wp.max(1.0 - wp.max(tension, 0.0) / wood.pull[k], 1.0e-3)
-                zero = wp.vec3()
-                now = spring_moment(model.joint_stiffness[k], joints.joint_q[k], zero) / rest
-                ahead = spring_moment(model.joint_stiffness[k], joints.joint_q[k], p.dt * joints.joint_qd[k]) / rest
+                turned = wp.vec3()
+                if parent < 0:
+                    turned = -forces.root_turn[tree]
+                step = p.dt * joints.joint_qd[k]
+                now = spring_moment(model.joint_stiffness[k], joints.joint_q[k], turned) / rest
+                ahead = now
+                if is_pushed:
+                    # a swing that the step hardly resolves would overshoot: it does not grow by more than it has grown
+                    ahead = spring_moment(model.joint_stiffness[k], joints.joint_q[k], turned + step) / rest
+                    ahead = wp.min(ahead, now + wp.max(now - stress_out[k][0], 0.0))
                 stress_out[k] = wp.vec2(now, ahead)
                 in_canes = wp.max(in_canes, wp.max(now, ahead) / capacity[k])
             else:

@@ -37,6 +37,7 @@ from vinesim.scene.plant_import.ties import tie_to_wires
 from vinesim.scene.plant_import.wood import build_model, join_models
 from vinesim.scene.plant_parameters import VineParameters
 from vinesim.scene.spec import Clutter, Datum, Scene, Sun, Wind
+from vinesim.scene.strength import with_reserve
 from vinesim.scene.terrain import Terrain, ground_height
 
 
@@ -113,7 +114,7 @@ def _generate(scene: Scene, parameters: VineParameters, terrain: Terrain | None)
         for i, box in enumerate(scene.boxes):
             half = 0.5 * box.size[0], 0.5 * box.size[1]
             model.box_pose[i] = terrain.resting_pose(box.x, box.y, box.yaw, half)
-    model = builder.solve_rest_pose(model).check()
+    model = with_reserve(builder.solve_rest_pose(model)).check()
     model.look = Look.of(scene)
     variety = [v.name for v in berries.VARIETIES].index(scene.fruit.varieties[0])
     for number, one in enumerate(scene.imported):
@@ -183,8 +184,10 @@ def _assemble_model(
     drawn = frames.compose(frames.inverse(base), frames.pose(bodies.origin, bodies.turn)[has])
     model.body_offset[:] = drawn[:, :3]
     model.body_rest[:] = frames.normalize(drawn[:, 3:])
-    for name in ("organ", "mass", "com", "inertia", "length", "radius", "drag"):
+    for name in ("organ", "mass", "com", "inertia", "length", "radius", "drag", "strength"):
         getattr(model, f"body_{name}")[:] = getattr(bodies, name)[has]
+    model.body_yield_strength[:] = parameters.cane.yield_share.value * model.body_strength
+    model.body_toughness[:] = np.where(model.body_strength > 0.0, parameters.cane.toughness.value, 0.0)
     model.joint_stiffness[:] = bodies.stiffness[has]
     model.joint_damping[:] = bodies.damping[has]
 

@@ -111,3 +111,32 @@ class Detachment:
     """[m] Distance of the cut or break from the base of the tree, along the wood."""
     point: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """[m] Place of the cut or break in the world."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Breakage:
+    """The event that something gave without parting: wood cracked, or a tie slipped or broke."""
+
+    kind: str
+    """``"crack"``: a cane has passed its strength and hangs on its fibres; ``"slip"``: a tie began to slip along its
+    wire; ``"untie"``: a tie broke."""
+    cause: str
+    """``"pull"``, ``"bend"`` or ``"twist"``."""
+    tick: int
+    time: float
+    """[s] Simulated time."""
+    tree: int
+    body: int
+    """Index of the body at whose joint the wood cracked, or which the tie held."""
+    tie: int
+    """Index of the tie, -1 for wood."""
+    actor: str
+    """Name of the actor who presses hardest on the tree; empty if none does."""
+    force: np.ndarray
+    """[3] N, force of the tree or the tie on the body, world axes."""
+    moment: np.ndarray
+    """[3] N m, moment about the joint on the body; 0 for a tie."""
+    place: float
+    """[m] Distance from the base of the tree along the wood."""
+    point: tuple[float, float, float]
+    """[m] Place in the world."""
