@@ -1,5 +1,5 @@
 """Wood that gives: peduncles in tension, bending and twist, at both ends and for seconds of load. Canes that keep a
-set, crack and break, against beam theory."""
+set, crack and break, against beam theory. Ties that slip and break."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ from vinesim import Simulation
 from vinesim.core import frames
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.cane import CaneBuilder
+from vinesim.scene.cane import assemble as assemble_canes
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.strength import peduncle_strength, weibull
+from vinesim.scene.surroundings import Tie, Wire
 from vinesim.scene.values import Detachment
 from vinesim.world import Physics
 
@@ -231,3 +233,52 @@ def test_a_side_shoot_tears_off_at_its_base():
             break
     assert [one.body for one in found] == [side[0]]
     assert found[0].place == pytest.approx(6 * 0.025)
+
+
+# Ties.
+
+
+def tied_cane(**numbers: float) -> Model:
+    """A pinned cane that stands 0.6 m high, bound at 0.5 m to a wire along y that does not deflect."""
+    up = frames.pose(np.zeros(3), frames.from_x_axis(np.array([0.0, 0.0, 1.0])))
+    cane = CaneBuilder(length=0.6, radius=0.006, segments=3, pose=up, base="pinned", beta=0.02)
+    wire = Wire((0.0, -2.0, 0.5), (0.0, 2.0, 0.5), tension=1e5)
+    return assemble_canes([cane], wires=[wire], ties=[Tie(along=0.5, wire=0, stiffness=2000.0, **numbers)])
+
+
+def pull_top(model: Model, direction: list[float], rate: float, seconds: float, dt: float) -> tuple[Simulation, list]:
+    simulation = Simulation(model, parameters=PhysicsParameters(dt=dt, gravity=0.0, sleep=False))
+    found = []
+    for _ in range(round(seconds / dt)):
+        force = rate * simulation.time * np.array(direction)
+        simulation.apply_wrench(2, force, at=simulation.tip())
+        simulation.step()
+        found += simulation.breakages
+        if found:
+            break
+    return simulation, found
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.01])
+def test_a_tie_slips_along_its_wire_at_its_force_and_breaks_at_its_strength(dt):
+    """A pull at 0.6 m is 0.6 / 0.5 of it at the tie."""
+    model = tied_cane(slip=12.0, strength=40.0)
+    simulation, (slip,) = pull_top(model, [0.0, 1.0, 0.0], 10.0, 3.0, dt)
+    assert (slip.kind, slip.tie, slip.place) == ("slip", 0, pytest.approx(0.5))
+    assert simulation.time * 10.0 * 0.6 / 0.5 == pytest.approx(12.0, rel=0.05)
+    simulation.step(20)
+    held = 2000.0 * (simulation.physics.plants.tie_anchor[0] - simulation.body_pose(2)[:3] - [0.0, 0.0, 0.1])
+    assert abs(held[1]) < 12.5
+    simulation, (broken,) = pull_top(model, [1.0, 0.0, 0.0], 20.0, 3.0, dt)
+    assert (broken.kind, simulation.state.tie_broken.tolist()) == ("untie", [True])
+    assert np.linalg.norm(broken.force) == pytest.approx(40.0, rel=0.02)
+    assert simulation.time * 20.0 * 0.6 / 0.5 == pytest.approx(40.0, rel=0.03)
+    before = simulation.tip()[0]
+    simulation.step(round(0.1 / dt))
+    assert simulation.tip()[0] > before + 0.001  # nothing pulls it back
+
+
+def test_ties_without_a_strength_hold():
+    simulation, found = pull_top(tied_cane(), [0.6, 0.8, 0.0], 200.0, 1.0, 0.01)
+    assert found == []
+    assert not simulation.state.tie_broken.any()

@@ -1,4 +1,5 @@
-"""Wood that gives: peduncles that break off at either end, canes that keep a set, crack and break.
+"""Wood and ties that give: peduncles that break off at either end, canes that keep a set, crack and break, ties that
+slip along their wires and break.
 
 A kernel finds the stress in the wood of all awake trees (:mod:`vinesim.kernels.plants.wood_stress`). The rest of this
 module deals with the few pieces of wood whose stress is near their strength. Only the client that owns a tree lets its
@@ -25,6 +26,12 @@ PULL = "pull"
 BEND = "bend"
 TWIST = "twist"
 """Causes of a break: the load that uses most of the strength."""
+SLIP = "slip"
+UNTIE = "untie"
+CRACK = "crack"
+"""Kinds of :class:`~vinesim.scene.values.Breakage`."""
+SLIP_PAUSE = 0.2
+"""[s] A tie that slips again after a shorter pause has not stopped: it is one event."""
 PLASTIC = 0
 FRACTURE = 1
 """Columns of :attr:`WoodMonitor.work`."""
@@ -91,6 +98,9 @@ class WoodMonitor:
         """[body] How the joints of canes give."""
         self.work = np.zeros((len(model.body_mass), 2))
         """[body, 2] J, work that the wood at each joint has taken up so far: for its set, and for its crack."""
+        self.tie_work = 0.0
+        """[J] Work that ties have taken up so far by slipping and breaking."""
+        self._slip_tick = np.full(len(model.tie_body), -(1 << 40), np.int64)
         self._bind()
         self.read_state()
 
@@ -107,7 +117,7 @@ class WoodMonitor:
             bend[end] = model.bunch_bend
         buffers = plants.buffers
         self._stress = buffers.pinned(np.zeros((buffers.slot_count, 2), np.float32))
-        self._largest = buffers.pinned(np.zeros(2, np.float32))
+        self._largest = buffers.pinned(np.zeros(3, np.float32))
         self._capacity = buffers.pinned(np.full(buffers.slot_count, np.inf, np.float32))
 
         def constant(values: np.ndarray, dtype: type) -> wp.array:
@@ -119,6 +129,9 @@ class WoodMonitor:
         wood.kind = constant(self._kind, wp.int32)
         wood.pull = constant(pull, wp.float32)
         wood.bend = constant(bend, wp.float32)
+        wood.tie_slip, wood.tie_strength, wood.tie_axis = (
+            buffers.arrays[name] for name in ("tie_slip", "tie_strength", "tie_axis")
+        )
         self._find = plants.launches.wood_stress(
             wood,
             buffers.reach(self._capacity, wp.float32, "wood_capacity"),
@@ -133,6 +146,15 @@ class WoodMonitor:
         capacity = self.law[bodies].capacity(self.plants.state.joint_flow[bodies])
         self._capacity[self.plants.buffers.slots[bodies]] = np.maximum(capacity, 1e-6)
 
+    def used_strength(self) -> np.ndarray:
+        """Returns for each cane of the awake trees the bending moment at its joint in the last step as a share of the
+        moment that cracks it [body]; 0 for all other bodies."""
+        model = self.plants.model
+        live = (self._kind == int(kernels.CANE)) & self.plants.state.tree_awake[model.body_tree]
+        live &= ~self.plants.state.body_cut
+        stress = self._stress[self.plants.buffers.slots, 0]
+        return np.where(live, stress / np.maximum(self.law.breaks, 1e-12), 0.0)
+
     def update(self) -> list[Overload]:
         """Let wood give, and find the wood that has broken or cracked in the last step: peduncles, then canes, each
         sorted by number. Call it once after each step."""
@@ -145,6 +167,41 @@ class WoodMonitor:
         found = self._break_stalks() if self._largest[0] >= 1.0 or self._load_time.any() else []
         if self._largest[1] >= 1.0:
             found += self._bend_canes()
+        return found
+
+    def give_ties(self) -> list[tuple[str, int, np.ndarray]]:
+        """Let ties slip and break that bear too much. Call it after :meth:`update`. Returns the kind, the tie and its
+        force [3] N on its body for each tie that broke or began to slip, sorted by tie."""
+        if self._largest[2] <= 1.0 or len(self.plants.awake) == 0:
+            return []
+        plants = self.plants
+        model = plants.model
+        state = plants.state
+        ties = plants.ties
+        tree = model.body_tree[model.tie_body]
+        live = np.flatnonzero(state.tree_awake[tree] & ~self._is_remote[tree] & ~state.tie_broken)
+        pose = state.body_q[model.tie_body[live]].astype(float)
+        point = pose[:, :3] + frames.rotate(pose[:, 3:], model.tie_point[live].astype(float))
+        stiffness = ties.stiffness[live].astype(float)
+        pull = stiffness[:, None] * (ties.anchor[live] - point)
+        size = np.linalg.norm(pull, axis=1)
+        along = (pull * ties.axis[live]).sum(1)
+        over = np.abs(along) - ties.slip[live]
+        breaks = size > ties.strength[live]
+        found = []
+        for i in np.flatnonzero(breaks | (over > 0.0)).tolist():
+            tie = int(live[i])
+            if breaks[i]:
+                plants.break_tie(tie)
+                self.tie_work += 0.5 * float(size[i]) ** 2 / float(stiffness[i])
+                found.append((UNTIE, tie, pull[i]))
+                continue
+            way = float(over[i] / stiffness[i])
+            plants.slide_tie(tie, -math.copysign(way, along[i]))
+            self.tie_work += (abs(float(along[i])) - 0.5 * float(over[i])) * way
+            if (plants.tick - self._slip_tick[tie]) * plants.dt > SLIP_PAUSE:
+                found.append((SLIP, tie, pull[i]))
+            self._slip_tick[tie] = plants.tick
         return found
 
     def _bend_canes(self) -> list[Overload]:

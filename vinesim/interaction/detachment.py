@@ -15,7 +15,7 @@ import numpy as np
 from vinesim.contact.contact_solver import ContactSolver
 from vinesim.core import frames
 from vinesim.core.errors import checked_index
-from vinesim.interaction.breaking import Overload, WoodMonitor, distance_from_base
+from vinesim.interaction.breaking import CRACK, Overload, WoodMonitor, distance_from_base
 from vinesim.interaction.stalk import cut_place, leave_stump, model_pieces, stalk_below, with_settled_stalk, with_stalk
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.rigid.free_bunch import FreeBunch
@@ -111,31 +111,46 @@ class DetachmentMonitor:
             at_bunch = broken.body == self.plants.model.bunch_body[broken.bunch]
             place = None if at_bunch else (broken.body, cut_place(self.plants.model, broken.body, 0.0))
             self._pick(broken.bunch, broken.cause, actor, broken.wrench, place, broken.late)
+        for kind, tie, pull in self.wood.give_ties():
+            model = self.plants.model
+            body = int(model.tie_body[tie])
+            self._record_breakage(kind, "pull", body, np.append(pull, np.zeros(3)), 0.0, tie)
 
     def _part_cane(self, broken: Overload) -> None:
         """Let a broken cane part at its joint, or report a crack."""
         plants = self.plants
         model = plants.model
         body = broken.body
-        actor = self._hardest_pressing_actor(model.body_tree == model.body_tree[body])
         if not broken.is_crack:
+            actor = self._hardest_pressing_actor(model.body_tree == model.body_tree[body])
             if not plants.state.body_cut[body]:
                 self._cut_joint(body, broken.cause, actor, broken.wrench)
             return
+        self._record_breakage(CRACK, broken.cause, body, broken.wrench, broken.late)
+
+    def _record_breakage(
+        self, kind: str, cause: str, body: int, wrench: np.ndarray, late: float, tie: int = -1
+    ) -> None:
+        """Record that the wood at the joint of ``body`` or a ``tie`` of it gave without parting."""
+        plants = self.plants
+        model = plants.model
+        along = np.zeros(3) if tie < 0 else model.tie_point[tie].astype(float)
+        pose = plants.state.body_q[body].astype(float)
+        actor = self._hardest_pressing_actor(model.body_tree == model.body_tree[body])
         self._breakages.append(
             Breakage(
-                "crack",
-                broken.cause,
+                kind,
+                cause,
                 plants.tick,
-                plants.tick * plants.dt - broken.late,
+                plants.tick * plants.dt - late,
                 int(model.body_tree[body]),
                 body,
-                -1,
+                tie,
                 actor,
-                broken.wrench[:3],
-                broken.wrench[3:],
-                distance_from_base(model, body),
-                tuple(plants.state.body_q[body, :3].astype(float).tolist()),
+                wrench[:3],
+                wrench[3:],
+                distance_from_base(model, body) + float(along[0]),
+                tuple((pose[:3] + frames.rotate(pose[3:], along)).tolist()),
             )
         )
 

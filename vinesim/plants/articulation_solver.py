@@ -308,6 +308,8 @@ class ArticulationSolver:
                 "tie_stiffness": ties.stiffness,
                 "tie_damping": ties.damping,
                 "tie_softening": ties.softening,
+                "tie_slip": ties.slip,
+                "tie_strength": ties.strength,
                 "tree_phi": self.phi,
                 "phi_used": self.phi_used,
                 "tree_rate": self.tree_rate,
@@ -681,6 +683,17 @@ class ArticulationSolver:
         tie = self.ties.add(body, point, self.state.body_q[body].astype(float), stiffness, damping)
         self._find_falling(self.bodies_of(np.array([tree])))
         return tie
+
+    def break_tie(self, tie: int) -> None:
+        """Let a tie of the model hold nothing any more (``State.tie_broken``). The tree does not wake."""
+        self.state.tie_broken[tie] = True
+        self.ties.release(tie)
+        self._find_falling(self.bodies_of(self.model.body_tree[self.model.tie_body[[tie]]]))
+
+    def slide_tie(self, tie: int, way: float) -> None:
+        """Move a tie of the model by ``way`` [m] along its wire (``State.tie_slid``)."""
+        self.state.tie_slid[tie] += way
+        self.ties.slide(tie, way * self.ties.axis[tie])
 
     def remove_tie(self, body: int, tie: int) -> None:
         """Remove a tie that :meth:`add_tie` added."""

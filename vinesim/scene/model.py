@@ -117,6 +117,10 @@ class Model(StructOfArrays):
     """Index (into ``fixed_start``) of the piece of wire that holds the tie; -1: the anchor does not move."""
     tie_stiffness: np.ndarray = array("tie", unit="N/m")
     tie_damping: np.ndarray = array("tie", unit="N s/m")
+    tie_slip: np.ndarray = array("tie", unit="N")
+    """Force along its wire at which a tie slips; 0: it never slips."""
+    tie_strength: np.ndarray = array("tie", unit="N")
+    """Force at which a tie breaks, or lets go of its wire; 0: it never breaks."""
 
     # leaves are fixed to bodies; visible to sensors, in physics only as drag and mass
     leaf_body: np.ndarray = array("leaf", unit="1", dtype=np.int32)

@@ -178,6 +178,10 @@ class Trellis(_Part, frozen=True, kw_only=True):
     tie_string: Annotated[Number, "m"]
     tie_stiffness: Annotated[Number, "N/m"]
     tie_damping: Annotated[Number, "s"]
+    tie_slip: Annotated[Number, "N"] = Number(10.0, "N", "GUESSED", "as in vine.toml")
+    """Force along its wire at which a tie slips."""
+    tie_strength: Annotated[Number, "N"] = Number(60.0, "N", "GUESSED", "as in vine.toml")
+    """Force at which a tie breaks, or lets go of its wire."""
 
 
 class Specimen(_Part, frozen=True, kw_only=True):

@@ -40,6 +40,10 @@ class State(StructOfArrays):
     is one rigid body."""
     tree_awake: np.ndarray = array("tree", unit="1", dtype=np.bool_)
     bunch_attached: np.ndarray = array("bunch", unit="1", dtype=np.bool_, fill=1)
+    tie_slid: np.ndarray = array("tie", unit="m")
+    """Distance by which each tie has slipped along its wire."""
+    tie_broken: np.ndarray = array("tie", unit="1", dtype=np.bool_)
+    """Whether the tie holds nothing any more."""
     cut_segment: np.ndarray = array("bunch", unit="1", dtype=np.int32, fill=-1)
     """Body of the segment of its peduncle in which each bunch was cut off; -1: it hangs, or has parted at its own
     joint."""
@@ -51,7 +55,7 @@ class State(StructOfArrays):
         """Returns the state with all trees asleep and without motion in the shape that their generator or builder
         gave them (``Model.joint_settled``)."""
         counts = model.counts()
-        state = cls.allocate(body=counts["body"], tree=counts["tree"], bunch=counts["bunch"])
+        state = cls.allocate(body=counts["body"], tree=counts["tree"], bunch=counts["bunch"], tie=counts["tie"])
         state.joint_q[:] = model.joint_settled
         state.body_q[:] = model.forward_kinematics(state.joint_q)
         return state

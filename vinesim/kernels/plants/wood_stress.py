@@ -31,6 +31,9 @@ class WoodStrength:
     kind: wp.array(dtype=wp.int32)  # NO_WOOD, STALK_BASE, STALK_END or CANE
     pull: wp.array(dtype=float)  # [N] tension at which the wood breaks
     bend: wp.array(dtype=float)  # [N m] bending moment at which a peduncle breaks; 1 for a cane
+    tie_slip: wp.array(dtype=float)  # [tie] N, force along its wire at which a tie slips
+    tie_strength: wp.array(dtype=float)  # [tie] N, force at which a tie breaks
+    tie_axis: wp.array(dtype=wp.vec3)  # [tie] direction of the wire
 
 
 @wp.func
@@ -57,6 +60,12 @@ def spring_moment(stiffness: wp.vec3, q: wp.quat, further: wp.vec3):
     s, _excess, v = middle_axes_scale(q)
     torque = wp.cw_mul(stiffness, 2.0 * s * v + further)
     return wp.sqrt(torque[1] * torque[1] + torque[2] * torque[2] + 0.75 * torque[0] * torque[0])
+
+
+@wp.func
+def tie_stretch(pose: wp.transform, point: wp.vec3, anchor: wp.vec3):
+    """Returns the vector [m] from the anchor of a tie to the point that it holds; ``point``: in the body's frame."""
+    return anchor - wp.transform_point(pose, point)
 
 
 @wp.kernel
@@ -86,8 +95,8 @@ def find_stress(
     bears now. carried_out: [body] scratch: wrench in each joint, about the body's origin. stress_out: [body] for a
     peduncle the used share of its strength and 0; for a cane its elastic moment [N m] now and, if the joint keeps its
     rate under a contact, at the end of the next step; both are raised for the tension in the cane. It is also read: the
-    moment before the step. largest_out: [2] largest used share
-    [1] of a peduncle, and largest moment of a cane over its capacity [1].
+    moment before the step. largest_out: [3] largest used share
+    [1] of a peduncle, largest moment of a cane over its capacity [1], and largest force of a tie over what it bears [1].
     """
     if wp.tid() >= count[0]:
         return
@@ -100,6 +109,7 @@ def find_stress(
         carried_out[k] = own_wrench(k, tree, p, model, tree_phi, tree_steps, forces, bodies, body_acceleration)
     in_stalks = float(0.0)
     in_canes = float(0.0)
+    in_ties = float(0.0)
     for i in range(size):
         k = first + (size - 1 - i) * model.pitch
         parent = model.body_parent[k]
@@ -109,6 +119,11 @@ def find_stress(
         if parent >= 0:
             lever = wp.transform_get_translation(pose) - wp.transform_get_translation(bodies.body_q[parent])
             carried_out[parent] = carried_out[parent] + wp.spatial_vector(force, moment + wp.cross(lever, force))
+        ties = model.tie_span[k]
+        for t in range(ties[0], ties[1]):
+            pull = model.tie_stiffness[t] * tie_stretch(pose, model.tie_point[t], forces.tie_anchor[t])
+            along = wp.abs(wp.dot(pull, wood.tie_axis[t]))
+            in_ties = wp.max(in_ties, wp.max(wp.length(pull) / wood.tie_strength[t], along / wood.tie_slip[t]))
         kind = wood.kind[k]
         if kind != NO_WOOD and (parent >= 0 or model.body_root[k] < 0):
             turn = wp.transform_get_rotation(pose)
@@ -138,3 +153,4 @@ def find_stress(
                 in_stalks = wp.max(in_stalks, used)
     wp.atomic_max(largest_out, 0, in_stalks)
     wp.atomic_max(largest_out, 1, in_canes)
+    wp.atomic_max(largest_out, 2, in_ties)

@@ -208,7 +208,7 @@ def _assemble_model(
         getattr(model, f"bunch_head_{name}")[:] = head[shoots.has_bunch]
 
     model.tie_body[:] = number[ties["shoot"], ties["slot"]]
-    for name in ("point", "anchor", "wire", "stiffness", "damping"):
+    for name in ("point", "anchor", "wire", "stiffness", "damping", "slip", "strength"):
         getattr(model, f"tie_{name}")[:] = ties[name]
 
     model.leaf_body[:] = carrier
