@@ -273,9 +273,7 @@ def test_a_tie_slips_along_its_wire_at_its_force_and_breaks_at_its_strength(dt):
     assert (broken.kind, simulation.state.tie_broken.tolist()) == ("untie", [True])
     assert np.linalg.norm(broken.force) == pytest.approx(40.0, rel=0.02)
     assert simulation.time * 20.0 * 0.6 / 0.5 == pytest.approx(40.0, rel=0.03)
-    before = simulation.tip()[0]
-    simulation.step(round(0.1 / dt))
-    assert simulation.tip()[0] > before + 0.001  # nothing pulls it back
+    assert simulation.physics.plants.tie_stiffness[0] == 0.0
 
 
 def test_ties_without_a_strength_hold():

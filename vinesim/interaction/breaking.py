@@ -98,6 +98,8 @@ class WoodMonitor:
         """[body] How the joints of canes give."""
         self.work = np.zeros((len(model.body_mass), 2))
         """[body, 2] J, work that the wood at each joint has taken up so far: for its set, and for its crack."""
+        self.given: set[int] = set()
+        """Trees whose wood or ties gave in the last step."""
         self.tie_work = 0.0
         """[J] Work that ties have taken up so far by slipping and breaking."""
         self._slip_tick = np.full(len(model.tie_body), -(1 << 40), np.int64)
@@ -159,6 +161,8 @@ class WoodMonitor:
         """Let wood give, and find the wood that has broken or cracked in the last step: peduncles, then canes, each
         sorted by number. Call it once after each step."""
         plants = self.plants
+        if self.given:
+            self.given = set()
         if len(plants.awake) == 0:
             return []
         self._largest[:] = 0.0
@@ -191,6 +195,7 @@ class WoodMonitor:
         found = []
         for i in np.flatnonzero(breaks | (over > 0.0)).tolist():
             tie = int(live[i])
+            self.given.add(int(tree[tie]))
             if breaks[i]:
                 plants.break_tie(tie)
                 self.tie_work += 0.5 * float(size[i]) ** 2 / float(stiffness[i])
@@ -247,6 +252,7 @@ class WoodMonitor:
         part = frames.multiply(whole, frames.conjugate(turned))
         plants.set_set(bodies, frames.multiply(state.joint_set[bodies].astype(float), part))
         self.read_state(bodies)
+        self.given.update(tree[bodies].tolist())
         return [
             Overload(int(bodies[i]), -1, self._cause(int(bodies[i]), wrench), wrench, is_crack=not breaks[i])
             for i, wrench in zip(events.tolist(), wrenches, strict=True)

@@ -435,6 +435,7 @@ class ArticulationSolver:
         state.joint_xd[body] = state.body_qd[body, :3]
         state.joint_qd[body] = state.body_qd[body, 3:]
         state.body_cut[body] = True
+        state.joint_set[body] = frames.IDENTITY
         self._detach_joints(self.bodies_of(np.array([tree])))
         self.wake(tree)
 

@@ -23,6 +23,7 @@ from vinesim.net.codec.json_values import COUNT, NUMBER, POSE, TEXT, THING, YES,
 from vinesim.net.codec.objects import check_object_id
 from vinesim.net.codec.robot import MAX_JOINTS
 from vinesim.net.codec.trees import MAX_BODIES, MAX_TREES
+from vinesim.net.codec.wood import decode_wood
 from vinesim.net.pace import MIN_FACTOR, PaceReport
 from vinesim.net.replication.authority import Claim
 from vinesim.scene.ids import LABEL_STRIDE
@@ -127,6 +128,8 @@ class RetainedRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknow
     stalk: tuple[int, int] | None = None
     """For a bunch that was cut in its peduncle: body of the segment in which it was cut, and place of the cut along it
     [0.1 mm]."""
+    wood: bytes = b""
+    """For a tree whose wood or ties have given: encoded by :func:`vinesim.net.codec.wood.encode_wood`."""
 
     @property
     def claim(self) -> Claim:
@@ -256,6 +259,8 @@ def decode_records(payload: bytes, counts: tuple[int, ...] | None = None) -> lis
             raise MessageError(f"record of object {record.object} with an impossible parent or list of cut bodies")
         if record.stalk is not None and not (record.stalk[0] >= 0 and 0 < record.stalk[1] < 1 << 16):
             raise MessageError(f"record of object {record.object} with an impossible stalk {record.stalk}")
+        if record.wood:
+            decode_wood(record.wood)
     return records
 
 

@@ -58,6 +58,7 @@ class LocalStep:
     has_body: Callable[[int], bool]
     carried_on: set[int]
     stalk_of: Callable[[int], tuple[int, int] | None]
+    wood_of: Callable[[int], bytes]
 
 
 class Sender:
@@ -345,10 +346,11 @@ class Sender:
         state.retained.publish(state.object_stream.cells((object_id,))[0], record)
 
     def _publish_tree_record(self, cell: Cell, record: RetainedRecord, step: LocalStep) -> None:
-        """Add all bodies that were cut off a tree to its retained record, and publish the record."""
+        """Add all bodies that were cut off a tree, and how its wood has given, to its retained record, and publish the
+        record."""
         first = int(self._state.model.tree_first[record.object])
         cut = tuple((first + step.detached_roots(record.object)[0]).tolist())
-        self._state.retained.publish(cell, msgspec.structs.replace(record, cut=cut))
+        self._state.retained.publish(cell, msgspec.structs.replace(record, cut=cut, wood=step.wood_of(record.object)))
 
     def _encode_tree(self, tree: int, claim: Claim, step: LocalStep, flags: int) -> tuple[bytes, TreeUpdate]:
         """Encode the state of a tree. Returns the message, and the state as receivers decode it.

@@ -140,3 +140,23 @@ class Breakage:
     """[m] Distance from the base of the tree along the wood."""
     point: tuple[float, float, float]
     """[m] Place in the world."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class GivenWood:
+    """How the wood and ties of one tree have given: joints [k] with a set, and ties [j] that have slipped or broken.
+
+    Places count from the tree's first body and the tree's first tie, and increase."""
+
+    joints: np.ndarray
+    """[k] int, places of the bodies."""
+    turns: np.ndarray
+    """[k, 4] float32, sets: unit quaternions xyzw."""
+    flows: np.ndarray
+    """[k] rad, float32: see ``State.joint_flow``."""
+    ties: np.ndarray
+    """[j] int, places of the ties."""
+    slid: np.ndarray
+    """[j] m, float32."""
+    broken: np.ndarray
+    """[j] bool"""
