@@ -30,6 +30,9 @@ SLIP = "slip"
 UNTIE = "untie"
 CRACK = "crack"
 """Kinds of :class:`~vinesim.scene.values.Breakage`."""
+PATIENCE = 0.5
+"""[s] Time for which the wood of a tree is watched after the tree was last pushed, held, blown or fast. DERIVED: longer
+than a swing is slow at its turning point."""
 SLIP_PAUSE = 0.2
 """[s] A tie that slips again after a shorter pause has not stopped: it is one event."""
 PLASTIC = 0
@@ -86,6 +89,7 @@ class WoodMonitor:
         bunches = len(model.bunch_body)
         self._load_time = np.zeros(bunches)
         self._used_before = np.zeros(bunches)
+        self._any_held = False
         self._wrenches: dict[int, tuple[int, int, np.ndarray]] = {}
         """Tick, body and wrench of the overloaded end of each overloaded bunch in the last step."""
         self.law = BendingLaw.of(
@@ -119,6 +123,9 @@ class WoodMonitor:
             bend[end] = model.bunch_bend
         buffers = plants.buffers
         self._stress = buffers.pinned(np.zeros((buffers.slot_count, 2), np.float32))
+        self._watch = buffers.pinned(np.zeros(len(model.tree_first), np.int32))
+        """[tree] Number of steps for which the wood of each tree will yet be watched."""
+        self._is_held = buffers.pinned(np.zeros(len(model.tree_first), np.bool_))
         self._largest = buffers.pinned(np.zeros(3, np.float32))
         self._capacity = buffers.pinned(np.full(buffers.slot_count, np.inf, np.float32))
 
@@ -137,6 +144,9 @@ class WoodMonitor:
         self._find = plants.launches.wood_stress(
             wood,
             buffers.reach(self._capacity, wp.float32, "wood_capacity"),
+            buffers.reach(self._is_held, wp.bool, "tree_held"),
+            max(1, round(PATIENCE / plants.dt)),
+            buffers.reach(self._watch, wp.int32, "wood_watch"),
             buffers.reach(self._stress, wp.vec2, "wood_stress"),
             buffers.reach(self._largest, wp.float32, "largest_stress"),
         )
@@ -148,11 +158,15 @@ class WoodMonitor:
         capacity = self.law[bodies].capacity(self.plants.state.joint_flow[bodies])
         self._capacity[self.plants.buffers.slots[bodies]] = np.maximum(capacity, 1e-6)
 
+    def _is_watched(self) -> np.ndarray:
+        """Returns whether the stress of each tree in the last step is known [tree] bool."""
+        return self.plants.state.tree_awake & (self._watch > 0)
+
     def used_strength(self) -> np.ndarray:
-        """Returns for each cane of the awake trees the bending moment at its joint in the last step as a share of the
+        """Returns for each cane of the watched trees the bending moment at its joint in the last step as a share of the
         moment that cracks it [body]; 0 for all other bodies."""
         model = self.plants.model
-        live = (self._kind == int(kernels.CANE)) & self.plants.state.tree_awake[model.body_tree]
+        live = (self._kind == int(kernels.CANE)) & self._is_watched()[model.body_tree]
         live &= ~self.plants.state.body_cut
         stress = self._stress[self.plants.buffers.slots, 0]
         return np.where(live, stress / np.maximum(self.law.breaks, 1e-12), 0.0)
@@ -166,6 +180,11 @@ class WoodMonitor:
         if len(plants.awake) == 0:
             return []
         self._largest[:] = 0.0
+        held = plants.held_bodies
+        if held or self._any_held:
+            self._is_held[:] = False
+            self._is_held[plants.model.body_tree[held]] = True
+            self._any_held = bool(held)
         self._find(len(plants.awake))
         plants.buffers.synchronize()
         found = self._break_stalks() if self._largest[0] >= 1.0 or self._load_time.any() else []
@@ -183,7 +202,7 @@ class WoodMonitor:
         state = plants.state
         ties = plants.ties
         tree = model.body_tree[model.tie_body]
-        live = np.flatnonzero(state.tree_awake[tree] & ~self._is_remote[tree] & ~state.tie_broken)
+        live = np.flatnonzero(self._is_watched()[tree] & ~self._is_remote[tree] & ~state.tie_broken)
         pose = state.body_q[model.tie_body[live]].astype(float)
         point = pose[:, :3] + frames.rotate(pose[:, 3:], model.tie_point[live].astype(float))
         stiffness = ties.stiffness[live].astype(float)
@@ -217,7 +236,7 @@ class WoodMonitor:
         state = plants.state
         slots = plants.buffers.slots
         tree = model.body_tree
-        live = (self._kind == int(kernels.CANE)) & state.tree_awake[tree] & ~state.body_cut & ~self._is_remote[tree]
+        live = (self._kind == int(kernels.CANE)) & self._is_watched()[tree] & ~state.body_cut & ~self._is_remote[tree]
         bodies = np.flatnonzero(live & (self._stress.max(1)[slots] >= self._capacity[slots])).astype(np.int32)
         if len(bodies) == 0:
             return []
@@ -269,7 +288,7 @@ class WoodMonitor:
         model = plants.model
         state = plants.state
         tree = model.body_tree[model.bunch_body]
-        watched = state.tree_awake[tree] & state.bunch_attached & ~self._is_remote[tree]
+        watched = self._is_watched()[tree] & state.bunch_attached & ~self._is_remote[tree]
         stress = self._stress[plants.buffers.slots[self._ends], 0]
         used = np.where(watched, stress.max(1), 0.0)
         before = self._used_before

@@ -1611,7 +1611,16 @@ class KernelLaunches:
         )
         return JointWrenches(places, count, carried, launch)
 
-    def wood_stress(self, wood: WoodStrength, capacity: wp.array, stress: wp.array, largest: wp.array) -> KernelGraph:
+    def wood_stress(
+        self,
+        wood: WoodStrength,
+        capacity: wp.array,
+        is_held: wp.array,
+        patience: int,
+        watch: wp.array,
+        stress: wp.array,
+        largest: wp.array,
+    ) -> KernelGraph:
         """Returns the launch that finds the stress in the wood of the trees of the last step. Arguments: see
         :func:`vinesim.kernels.plants.wood_stress.find_stress`."""
         return self.graph(
@@ -1629,6 +1638,10 @@ class KernelLaunches:
                 self._bodies,
                 "body_acceleration",
                 self.fill(structs.JointState),
+                "tree_rate",
+                is_held,
+                patience,
+                watch,
                 "subtree_wrench",
                 stress,
                 largest,
