@@ -202,7 +202,7 @@ class Simulation:
 
     @property
     def breakages(self) -> tuple[Breakage, ...]:
-        """What gave without parting in the last call of :meth:`step`: canes that cracked."""
+        """What gave without parting in the last call of :meth:`step`: canes that cracked, ties that slipped or broke."""
         return tuple(self._breakages)
 
     @property
