@@ -64,7 +64,7 @@ class Physics:
         model: constants of the vineyard.
         parameters: all numbers of the physics.
         device: ``"cpu"`` or ``"cuda"``, see :class:`ArticulationSolver`.
-        detachment: whether bunches detach when they are pulled too hard.
+        detachment: whether bunches detach when they are pulled too hard, and wood and ties give.
         """
         p = parameters
         self.model = model

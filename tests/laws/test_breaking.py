@@ -11,12 +11,16 @@ from scipy.stats import kstest, weibull_min
 
 from vinesim import Simulation
 from vinesim.core import frames
+from vinesim.interaction.breaking import WoodMonitor
+from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.plants.device_buffers import DeviceBuffers
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.cane import CaneBuilder
 from vinesim.scene.cane import assemble as assemble_canes
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.scene.state import State
 from vinesim.scene.strength import peduncle_strength, weibull
 from vinesim.scene.surroundings import Tie, Wire
 from vinesim.scene.values import Detachment
@@ -233,6 +237,26 @@ def test_a_side_shoot_tears_off_at_its_base():
             break
     assert [one.body for one in found] == [side[0]]
     assert found[0].place == pytest.approx(6 * 0.025)
+
+
+def test_wood_gives_alike_in_the_memory_layout_of_a_gpu():
+    model = assemble([wood(yield_strength=50e6).tree() for _ in range(3)])
+    runs = []
+    for interleave in (0, 32):
+        state = State.at_rest(model)
+        buffers = DeviceBuffers("cpu", interleave)
+        solver = ArticulationSolver(model, state, PhysicsParameters(gravity=0.0), buffers=buffers)
+        monitor = WoodMonitor(solver, np.zeros(3, bool))
+        solver.wake(np.arange(3))
+        found = []
+        for step in range(110):
+            solver.body_load[[11, 23, 35], 2] = -step * np.array([0.25, 0.3, 0.35])
+            solver.predict()
+            solver.integrate()
+            found += [(step, one.body, one.is_crack) for one in monitor.update()]
+        assert len(found) >= 2
+        runs.append((found, state.joint_set.tobytes(), state.joint_flow.tobytes()))
+    assert runs[0] == runs[1]
 
 
 # Ties.

@@ -86,7 +86,7 @@ class Simulation:
             dt: duration of a step [s], 0.01 unless given here or in ``parameters``.
             parameters: all numbers of the physics; they replace the parameters of the scene.
             sleep: whether trees at rest fall asleep, which saves time; it replaces ``parameters.sleep``.
-            detach: whether bunches detach when they are pulled too hard.
+            detach: whether bunches detach when they are pulled too hard, and wood and ties give.
             device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``, for stepping plants and for cameras and lidars.
         """
         if not isinstance(detach, bool):
@@ -202,7 +202,8 @@ class Simulation:
 
     @property
     def breakages(self) -> tuple[Breakage, ...]:
-        """What gave without parting in the last call of :meth:`step`: canes that cracked, ties that slipped or broke."""
+        """What gave without parting in the last call of :meth:`step`: canes that cracked, ties that slipped or
+        broke."""
         return tuple(self._breakages)
 
     @property
