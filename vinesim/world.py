@@ -30,6 +30,7 @@ from vinesim.scene.state import State
 from vinesim.scene.values import (
     Contact,
     Detachment,
+    GivenWood,
     HandSample,
     HumanPose,
     HumanSpec,
@@ -63,7 +64,7 @@ class Physics:
         model: constants of the vineyard.
         parameters: all numbers of the physics.
         device: ``"cpu"`` or ``"cuda"``, see :class:`ArticulationSolver`.
-        detachment: whether bunches detach when they are pulled too hard.
+        detachment: whether bunches detach when they are pulled too hard, and wood and ties give.
         """
         p = parameters
         self.model = model
@@ -353,6 +354,31 @@ class Physics:
         self.detachment_monitor.apply_remote_stump(stump, segment, at, floats=floats)
         self._body_q = None
 
+    def apply_remote_wood(self, tree: int, given: GivenWood) -> None:
+        """Let the wood and ties of a tree give as on the client that owned it. Joints that have given more here stay.
+
+        Nothing happens if the tree has no such bodies or ties.
+        """
+        model = self.model
+        state = self.state
+        ties = np.flatnonzero(model.body_tree[model.tie_body] == tree)
+        if given.joints.max(initial=-1) >= model.tree_core[tree] or given.ties.max(initial=-1) >= len(ties):
+            return
+        bodies = int(model.tree_first[tree]) + given.joints
+        further = given.flows > state.joint_flow[bodies]
+        bodies = bodies[further]
+        if len(bodies):
+            self.plants.set_set(bodies, given.turns[further])
+            state.joint_flow[bodies] = given.flows[further]
+            self.detachment_monitor.wood.read_state(bodies)
+        for tie, slid, broken in zip(ties[given.ties].tolist(), given.slid.tolist(), given.broken, strict=True):
+            if (way := slid - float(state.tie_slid[tie])) != 0.0:
+                self.plants.slide_tie(tie, way)
+                state.tie_slid[tie] = slid
+            if broken and not state.tie_broken[tie]:
+                self.plants.break_tie(tie)
+        self._body_q = None
+
     def apply_remote_rest(self, trees: list[int], joint_q: list[np.ndarray]) -> None:
         """Put trees to sleep in the rest poses that the clients that own the trees have sent. No tree wakes.
 
@@ -360,7 +386,9 @@ class Physics:
         tree is named several times, its last pose counts.
         """
         for tree, rotations in zip(trees, joint_q, strict=True):
-            self.state.joint_q[self.model.bodies_of(tree)] = frames.normalize(np.asarray(rotations, np.float32))
+            bodies = self.model.bodies_of(tree)
+            turned = self.state.elastic_turn(bodies, np.asarray(rotations, np.float32))
+            self.state.joint_q[bodies] = frames.normalize(np.asarray(turned, np.float32))
         resting = np.unique(trees).astype(np.int32)
         self.plants.put_to_sleep(resting)
         self.contact_solver.update_tree_bounds(resting)

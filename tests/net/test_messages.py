@@ -44,10 +44,11 @@ from vinesim.net.codec.messages import FAMILIES, MESSAGES, Counters, Traffic, sc
 from vinesim.net.codec.objects import ObjectStates, check_object_id, decode_objects, encode_objects
 from vinesim.net.codec.robot import MAX_JOINTS, decode_robot, encode_robot
 from vinesim.net.codec.trees import TreeStates, decode_trees, encode_trees, quantise_tree
+from vinesim.net.codec.wood import decode_wood, encode_wood
 from vinesim.net.pace import PaceReport
 from vinesim.net.replication.authority import Claim
 from vinesim.scene import ids
-from vinesim.scene.values import LightPattern, Lights, RobotUpdate
+from vinesim.scene.values import GivenWood, LightPattern, Lights, RobotUpdate
 
 
 def robot(rng: np.random.Generator, joints: int = 14) -> RobotUpdate:
@@ -454,10 +455,26 @@ def record(**change) -> RetainedRecord:
     return RetainedRecord(**{**usual, "pose": (1.0, 2.0, 0.1, 0.0, 0.6, 0.0, 0.8), "parent": "box/2", **change})
 
 
+def gave(turn: float = 1.0, flow: float = 0.2, slid: float = 0.1, places: tuple[int, int] = (3, 7)) -> GivenWood:
+    turns = np.array([[0.0, 0.6, 0.0, 0.8], [0.0, 0.0, 0.0, turn]], np.float32)
+    flows = np.array([0.1, flow], np.float32)
+    return GivenWood(np.array(places), turns, flows, np.array([2]), np.array([slid], np.float32), np.array([True]))
+
+
+def test_how_wood_has_given_is_decoded_to_the_bit():
+    sent = gave()
+    received = decode_wood(encode_wood(sent))
+    for name in ("joints", "turns", "flows", "ties", "slid", "broken"):
+        np.testing.assert_array_equal(getattr(received, name), getattr(sent, name))
+    nothing = decode_wood(b"")
+    assert encode_wood(nothing) == b""
+
+
 def test_records_are_decoded_as_encoded():
     sent = [
         record(),
         record(stalk=(12, 345)),
+        record(wood=encode_wood(gave())),
         record(object=ids.object_id(ids.ObjectKind.TREE, 5), parent="", cut=(7, 9), trees=b"abc"),
     ]
     received = decode_records(encode_records(sent))
@@ -483,6 +500,12 @@ def test_records_are_decoded_as_encoded():
         ({"stalk": (-1, 10)}, "impossible stalk"),
         ({"stalk": (5, 0)}, "impossible stalk"),
         ({"stalk": (5, 65536)}, "impossible stalk"),
+        ({"wood": b"\x01"}, "wood of 0 joints in 1 B"),
+        ({"wood": b"\x09\x00" + 22 * b"\x00"}, "wood of 9 joints in 24 B"),
+        ({"wood": encode_wood(gave(turn=0.5))}, "no rotation"),
+        ({"wood": encode_wood(gave(flow=np.nan))}, "out of range"),
+        ({"wood": encode_wood(gave(slid=np.inf))}, "out of range"),
+        ({"wood": encode_wood(gave(places=(3, 3)))}, "does not increase"),
         ({"parent": "x" * 201}, "impossible"),
     ],
 )

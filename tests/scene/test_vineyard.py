@@ -9,6 +9,7 @@ import sys
 import msgspec
 import numpy as np
 import pytest
+from scipy.stats import kstest, weibull_min
 
 from tests.support import beam_theory
 from tests.support.long_rows import long
@@ -19,6 +20,7 @@ from vinesim.scene.berries import VARIETIES
 from vinesim.scene.generation.vineyard import generate, generate_uncached
 from vinesim.scene.ids import Organ
 from vinesim.scene.state import State
+from vinesim.scene.strength import weibull
 from vinesim.scene.summary import summary_rows, total_leaf_area
 
 pytestmark = pytest.mark.slow
@@ -230,7 +232,21 @@ def test_a_peduncle_breaks_where_its_outer_fibre_reaches_the_strength(vineyard):
     radius = model.body_radius[model.body_parent[model.bunch_body], 1].astype(float)
     y = (np.arange(2000) + 0.5) / 1000.0 - 1.0  # of the radius
     moment = (strength * y * y * 2.0 * np.sqrt(1.0 - y * y)).sum() * 1e-3 * radius**3
-    np.testing.assert_allclose(model.bunch_bend, moment, rtol=1e-3)
+    ranges = [VARIETIES[variety].peduncle_pull for variety in model.bunch_variety]
+    median = [weibull_min.median(shape, scale=scale) for scale, shape in (weibull(*ends) for ends in ranges)]
+    np.testing.assert_allclose(model.bunch_bend, moment * model.bunch_pull / median, rtol=1e-3)
+
+
+def test_peduncles_are_as_strong_as_their_variety(vineyard):
+    """Of each variety the strengths follow the Weibull distribution whose 5 % and 95 % quantiles its file gives."""
+    model = generate(scenes.load_scene("vsp"))
+    for variety in np.unique(model.bunch_variety):
+        low, high = VARIETIES[variety].peduncle_pull
+        scale, shape = weibull(low, high)
+        np.testing.assert_allclose(weibull_min.ppf([0.05, 0.95], shape, scale=scale), [low, high], rtol=1e-9)
+        pulls = model.bunch_pull[model.bunch_variety == variety]
+        assert len(pulls) > 30
+        assert kstest(pulls, weibull_min(shape, scale=scale).cdf).pvalue > 0.05
 
 
 def test_tendone_heights_and_leaves():

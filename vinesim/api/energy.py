@@ -66,7 +66,7 @@ def energy(plants: ArticulationSolver, gravity: float, trees: np.ndarray | None 
     pose = state.body_q[held[ties]].astype(float)
     point = pose[:, :3] + frames.rotate(pose[:, 3:], model.tie_point[ties].astype(float))
     away = point - plants.tie_anchor[ties]
-    whole = point - model.tie_anchor[ties]
+    whole = point - model.tie_anchor[ties] - state.tie_slid[ties, None] * plants.ties.axis[ties]
     whole = np.where(np.isin(ties, plants.ties.on_wire)[:, None], whole, away)
     elastic += 0.5 * float(plants.tie_stiffness[ties] @ (away * whole).sum(1))
     return Energy(kinetic, elastic, gravity * float(mass @ com[:, 2]))

@@ -38,7 +38,7 @@ from vinesim.scene.spec import Scene, load_scene
 from vinesim.scene.state import State
 from vinesim.scene.surroundings import Box, main_axis
 from vinesim.scene.terrain import Terrain, on_ground
-from vinesim.scene.values import Contact, Detachment, RigidBox, Snapshot
+from vinesim.scene.values import Breakage, Contact, Detachment, RigidBox, Snapshot
 from vinesim.scene.wind import Wind, wind_of
 from vinesim.wind.sway import Sway
 from vinesim.world import Physics
@@ -86,7 +86,7 @@ class Simulation:
             dt: duration of a step [s], 0.01 unless given here or in ``parameters``.
             parameters: all numbers of the physics; they replace the parameters of the scene.
             sleep: whether trees at rest fall asleep, which saves time; it replaces ``parameters.sleep``.
-            detach: whether bunches detach when they are pulled too hard.
+            detach: whether bunches detach when they are pulled too hard, and wood and ties give.
             device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``, for stepping plants and for cameras and lidars.
         """
         if not isinstance(detach, bool):
@@ -119,6 +119,7 @@ class Simulation:
         self._loads: dict[int, np.ndarray] = {}
         self._pushed: set[tuple[str, str]] = set()
         self._detachments: list[Detachment] = []
+        self._breakages: list[Breakage] = []
         self._primitives: Primitives | None = None
         self._sway = Sway(model)
         self._fault_log = FaultLog(_warn_caller_of_step)
@@ -136,6 +137,7 @@ class Simulation:
             raise UsageError(f"count is {count}; give a whole number of steps, 0 or more")
         self._check_joints(self.physics.plants.awake)
         self._detachments = []
+        self._breakages = []
         for name in self.robots.keys() - set(self.physics.rigid.robots):  # robots that are no longer in the physics
             self._forget_robot(name)
         for _ in range(count):
@@ -145,6 +147,7 @@ class Simulation:
                 pusher.control()
             self.physics.step()
             self._detachments += self.physics.detachments
+            self._breakages += self.physics.detachment_monitor.breakages
         for body, before in self._loads.items():
             self.physics.plants.body_load[body] = before
         if self._loads:  # a tree that fell asleep under its load must move again
@@ -196,6 +199,12 @@ class Simulation:
     def detachments(self) -> tuple[Detachment, ...]:
         """Bunches and canes that left their plant in the last call of :meth:`step`."""
         return tuple(self._detachments)
+
+    @property
+    def breakages(self) -> tuple[Breakage, ...]:
+        """What gave without parting in the last call of :meth:`step`: canes that cracked, ties that slipped or
+        broke."""
+        return tuple(self._breakages)
 
     @property
     def faults(self) -> dict[str, int]:

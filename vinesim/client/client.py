@@ -458,6 +458,7 @@ class Client:
                 carried_on=carried_on,
                 stalk_of=objects.stalk_of,
                 stumps_of=objects.stumps_of,
+                wood_of=objects.wood_of,
             )
             for update in settled:
                 # All copies hold the quantised state of the last message, so this client takes it, too.
@@ -485,6 +486,7 @@ class Client:
                     detached=supported,
                     pose_on_support=self.physics.support_tracker.pose_on_support,
                     stalk_of=self.objects.stalk_of,
+                    wood_of=self.objects.wood_of,
                 )
 
     def side_of(self, point: np.ndarray) -> str:

@@ -20,6 +20,7 @@ def _elementwise(function: Callable[..., float], arguments: int) -> Callable[...
 
 
 exp = _elementwise(math.exp, 1)
+log = _elementwise(math.log, 1)
 cbrt = _elementwise(math.cbrt, 1)
 arctan2 = _elementwise(math.atan2, 2)
 power = _elementwise(math.pow, 2)

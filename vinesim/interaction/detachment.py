@@ -12,22 +12,19 @@ import dataclasses
 import math
 
 import numpy as np
-import warp as wp
 
 from vinesim.contact.contact_solver import ContactSolver
 from vinesim.core import frames
 from vinesim.core.errors import checked_index
-from vinesim.core.warp_arrays import share
+from vinesim.interaction.breaking import CRACK, Overload, WoodMonitor, distance_from_base
 from vinesim.interaction.stalk import cut_place, leave_stump, model_pieces, stalk_below, with_settled_stalk, with_stalk
-from vinesim.kernels.graph import KernelGraph, KernelLaunch
-from vinesim.kernels.plants.tree_checks import count_overloaded_steps
-from vinesim.plants.articulation_solver import ArticulationSolver, spans
+from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.rigid.free_bunch import FreeBunch
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene.ids import Organ
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.spare_bodies import PLACE_STEP
-from vinesim.scene.values import Contact, Detachment
+from vinesim.scene.values import Breakage, Contact, Detachment
 
 SAME_CUT = 2e-3
 """Wood shorter than this before or beyond a cut [m] is not cut again: a blade that closes twice cuts once."""
@@ -75,7 +72,6 @@ class DetachmentMonitor:
     ) -> None:
         """``parameters``: ``detachment_duration`` is the time after which an overloaded peduncle breaks,
         ``cutting_strength`` the strength of wood."""
-        self._overload_limit = parameters.steps(parameters.detachment_duration)
         self._cutting_strength = parameters.cutting_strength
         self.plants = plants
         self.rigid = rigid
@@ -86,42 +82,14 @@ class DetachmentMonitor:
         caller writes them.
         """
         model = plants.model
-        self._overloaded_steps = np.zeros(len(model.bunch_body), np.int32)
         self._bunch_of = model.bunch_of_body()
-        trees = model.body_tree[model.bunch_body]
-        order = np.argsort(trees, kind="stable")
-        self._bunches = order.astype(np.int32)
-        self._first = np.searchsorted(trees[order], np.arange(len(model.tree_first) + 1))
         self._wood = np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE)) | model.is_spare()
-        self._awake: np.ndarray | None = None
-        self._awake_bunches = np.zeros(len(order), np.int32)
-        self._longest = np.zeros(1, np.int32)
+        self.wood = WoodMonitor(plants, contact_solver.remote_trees, parameters)
+        """Finds the wood that breaks under its load."""
+        self.breakages: tuple[Breakage, ...] = ()
+        """What has given without parting in the last step."""
+        self._breakages: list[Breakage] = []
         self._detachments: list[Detachment] = []
-        self._bind()
-
-    def _bind(self) -> None:
-        model = self.plants.model
-        self._peduncles = peduncles = self.plants.launches.joint_wrenches(max(len(self._bunches), 1))
-        count_steps = KernelLaunch(
-            count_overloaded_steps,
-            [
-                share(model.bunch_body, wp.int32),
-                share(model.body_tree, wp.int32),
-                share(model.bunch_pull, wp.float32),
-                share(model.bunch_bend, wp.float32),
-                share(peduncles.count, wp.int32),
-                share(self._awake_bunches, wp.int32),
-                share(peduncles.carried, wp.spatial_vector),
-                share(self.plants.state.bunch_attached, wp.bool),
-                share(self.contact_solver.remote_trees, wp.bool),
-            ],
-            [share(self._overloaded_steps, wp.int32), share(self._longest, wp.int32)],
-        )
-        if self.plants.buffers.has_copies:
-            self._count_overloaded_steps = KernelGraph(count_steps)
-            self._weigh = self.plants.launches.graph(peduncles.launch)
-        else:
-            self._count_overloaded_steps = KernelGraph(peduncles.launch, count_steps)
 
     # ------------------------------------------------------------------ the tick
 
@@ -132,45 +100,63 @@ class DetachmentMonitor:
             self._detach_overloaded()
         if any(blade.closing for blade in self.blades):
             self._cut_with_blades()
+        self.breakages, self._breakages = tuple(self._breakages), []
         taken = tuple(sorted(self._detachments, key=lambda parting: parting.body))
         self._detachments = []
         return taken
 
     def _detach_overloaded(self) -> None:
-        """Detach bunches whose peduncles were overloaded for ``detachment_duration``, on trees that this client
-        controls."""
-        self._list_awake_bunches()
-        self._longest[0] = 0
-        count = int(self._peduncles.count[0])
-        if self.plants.buffers.has_copies:
-            self._weigh(count)
-            self.plants.buffers.synchronize()
-        self._count_overloaded_steps(count)
-        if self._longest[0] < self._overload_limit:
-            return
-        model = self.plants.model
-        attached = self.plants.state.bunch_attached
-        for i in np.flatnonzero(self._overloaded_steps[self._awake_bunches[:count]] >= self._overload_limit).tolist():
-            bunch = int(self._awake_bunches[i])
-            is_remote = self.contact_solver.remote_trees[model.body_tree[model.bunch_body[bunch]]]
-            if attached[bunch] and not is_remote:
-                square = np.square(self._peduncles.carried[i])
-                pulled = square[:3].sum() / np.square(model.bunch_pull[bunch])
-                bent = square[3:].sum() / np.square(model.bunch_bend[bunch])
-                cause = "pull" if pulled >= bent else "bend"
-                actor = self._hardest_pressing_actor(bunch)
-                self._pick(bunch, cause, actor, self._peduncles.carried[i].copy())
+        """Detach what has broken under its load, on trees that this client controls."""
+        for broken in self.wood.update():
+            if broken.bunch < 0:
+                self._part_cane(broken)
+                continue
+            actor = self._hardest_pressing_actor(self._bunch_of == broken.bunch)
+            at_bunch = broken.body == self.plants.model.bunch_body[broken.bunch]
+            place = None if at_bunch else (broken.body, cut_place(self.plants.model, broken.body, 0.0))
+            self._pick(broken.bunch, broken.cause, actor, broken.wrench, place, broken.late)
+        for kind, tie, pull in self.wood.give_ties():
+            model = self.plants.model
+            body = int(model.tie_body[tie])
+            self._record_breakage(kind, "pull", body, np.append(pull, np.zeros(3)), 0.0, tie)
 
-    def _list_awake_bunches(self) -> None:
-        """List the bunches of awake trees, including picked ones."""
-        awake = self.plants.awake
-        if awake is not self._awake:
-            self._awake = awake
-            first = self._first[awake]
-            bunches = self._bunches[spans(first, self._first[awake + 1] - first)]
-            self._peduncles.count[0] = len(bunches)
-            self._awake_bunches[: len(bunches)] = bunches
-            self._peduncles.places[: len(bunches)] = self.plants.buffers.slots[self.plants.model.bunch_body[bunches]]
+    def _part_cane(self, broken: Overload) -> None:
+        """Let a broken cane part at its joint, or report a crack."""
+        plants = self.plants
+        model = plants.model
+        body = broken.body
+        if not broken.is_crack:
+            actor = self._hardest_pressing_actor(model.body_tree == model.body_tree[body])
+            if not plants.state.body_cut[body]:
+                self._cut_joint(body, broken.cause, actor, broken.wrench)
+            return
+        self._record_breakage(CRACK, broken.cause, body, broken.wrench, broken.late)
+
+    def _record_breakage(
+        self, kind: str, cause: str, body: int, wrench: np.ndarray, late: float, tie: int = -1
+    ) -> None:
+        """Record that the wood at the joint of ``body`` or a ``tie`` of it gave without parting."""
+        plants = self.plants
+        model = plants.model
+        along = np.zeros(3) if tie < 0 else model.tie_point[tie].astype(float)
+        pose = plants.state.body_q[body].astype(float)
+        actor = self._hardest_pressing_actor(model.body_tree == model.body_tree[body])
+        self._breakages.append(
+            Breakage(
+                kind,
+                cause,
+                plants.tick,
+                plants.tick * plants.dt - late,
+                int(model.body_tree[body]),
+                body,
+                tie,
+                actor,
+                wrench[:3],
+                wrench[3:],
+                distance_from_base(model, body) + float(along[0]),
+                tuple((pose[:3] + frames.rotate(pose[3:], along)).tolist()),
+            )
+        )
 
     def _cut_with_blades(self) -> None:
         """Cut the wood in the mouths of closing blades."""
@@ -300,7 +286,7 @@ class DetachmentMonitor:
         stalk beyond the cut. None: the bunch parts at its own joint and keeps no stalk. Raises :class:`ValueError` if
         the bunch cannot be detached there.
         """
-        bunch = checked_index("bunch", bunch, len(self._overloaded_steps))
+        bunch = checked_index("bunch", bunch, len(self.plants.model.bunch_body))
         if not self.plants.state.bunch_attached[bunch]:
             raise ValueError(f"bunch {bunch} was picked already")
         body = self.plants.model.bunch_body[bunch]
@@ -311,7 +297,13 @@ class DetachmentMonitor:
         self._pick(bunch, cause, actor, self.plants.joint_wrench(np.array([body]))[0], place)
 
     def _pick(
-        self, bunch: int, cause: str, actor: str, carried: np.ndarray, place: tuple[int, float] | None = None
+        self,
+        bunch: int,
+        cause: str,
+        actor: str,
+        carried: np.ndarray,
+        place: tuple[int, float] | None = None,
+        late: float = 0.0,
     ) -> None:
         plants = self.plants
         model = self.plants.model
@@ -346,12 +338,12 @@ class DetachmentMonitor:
         self.rigid.ignore_overlaps(bunch)
         self.contact_solver.ignore_overlaps(bunch, *_box_around(loose, plants.state.body_q[body].astype(float)))
         plants.state.bunch_attached[bunch] = False
-        self._overloaded_steps[bunch] = 0
+        self.wood.forget(bunch)
         plants.set_mass(body, STUB_MASS)
         if state.tree_fine[tree]:
             plants.berry_clusters.release(bunch)
         plants.body_drag[body] = 0.0
-        self._record(body, bunch, cause, actor, carried, place)
+        self._record(body, bunch, cause, actor, carried, place, late)
 
     def _take_stalk(
         self, bunch: int, loose: FreeBunch, velocity: np.ndarray, segment: int, at: float
@@ -394,7 +386,11 @@ class DetachmentMonitor:
             return
         if plants.state.body_cut[body] and not at:
             raise ValueError(f"body {body} was cut already")
-        carried = plants.joint_wrench(np.array([body]))[0]
+        self._cut_joint(body, cause, actor, plants.joint_wrench(np.array([body]))[0])
+
+    def _cut_joint(self, body: int, cause: str, actor: str, carried: np.ndarray) -> None:
+        """Part a cane at the joint between ``body`` and its parent."""
+        plants = self.plants
         tree = int(plants.model.body_tree[body])
         plants.wake(tree)
         plants.forward_kinematics(np.array([tree]))
@@ -466,20 +462,38 @@ class DetachmentMonitor:
         actor: str,
         carried: np.ndarray,
         place: tuple[int, float] | None = None,
+        late: float = 0.0,
     ) -> None:
-        tree = int(self.plants.model.body_tree[body])
-        force = carried[:3].astype(float)
-        moment = carried[3:].astype(float)
+        """Record a detachment at ``place`` (a segment and the distance from its origin) or at the joint of ``body``;
+        ``late`` [s]: time from the detachment to the end of the step."""
+        plants = self.plants
+        tree = int(plants.model.body_tree[body])
         segment, at = (-1, 0.0) if place is None else place
+        parted = body if place is None else segment
+        pose = plants.state.body_q[parted].astype(float)
         self._detachments.append(
-            Detachment(self.plants.tick, tree, body, bunch, cause, actor, force, moment, segment, at)
+            Detachment(
+                plants.tick,
+                tree,
+                body,
+                bunch,
+                cause,
+                actor,
+                carried[:3].astype(float),
+                carried[3:].astype(float),
+                segment,
+                at,
+                time=plants.tick * plants.dt - late,
+                place=distance_from_base(plants.model, parted) + at,
+                point=tuple((pose[:3] + frames.rotate(pose[3:], np.array([at, 0.0, 0.0]))).tolist()),
+            )
         )
 
-    def _hardest_pressing_actor(self, bunch: int) -> str:
-        """Returns the name of the actor that presses hardest on a bunch; empty if no actor does."""
+    def _hardest_pressing_actor(self, bodies: np.ndarray) -> str:
+        """Returns the name of the actor that presses hardest on ``bodies`` [body] bool; empty if no actor does."""
         pushes: dict[str, float] = {}
         for contact in self.contact_solver.contacts + self.hand_contacts:
-            if self._bunch_of[contact.body] == bunch and contact.actor not in ("world", "plants"):
+            if bodies[contact.body] and contact.actor not in ("world", "plants"):
                 pushes[contact.actor] = pushes.get(contact.actor, 0.0) + float(np.linalg.norm(contact.force))
         return max(sorted(pushes), key=lambda actor: pushes[actor], default="")
 

@@ -52,6 +52,7 @@ from vinesim.kernels.plants.kinematics import forward_kinematics
 from vinesim.kernels.plants.lean_prediction import predict_lean
 from vinesim.kernels.plants.prediction import predict
 from vinesim.kernels.plants.tree_checks import find_fastest
+from vinesim.kernels.plants.wood_stress import WoodStrength, find_stress
 from vinesim.plants.contact_loads import ContactLoads
 from vinesim.plants.device_buffers import DeviceBuffers
 from vinesim.plants.segment_parts import Part, joint_compliance, part_of, place_between, relaxed_joint
@@ -279,6 +280,8 @@ class ArticulationSolver:
         self._root = np.full(bodies, -1, np.int32)
         self._offset = model.body_offset.copy()
         self._rest = model.body_rest.copy()
+        if len(bent := np.flatnonzero((state.joint_set[:, :3] != 0.0).any(1))):
+            self._rest[bent] = frames.normalize(frames.multiply(model.body_rest[bent], state.joint_set[bent]))
         self._falls = np.zeros(bodies, np.bool_)  # whether no tie holds the body's floating component
         self._floating, self._divided_floating = (np.zeros(bodies, np.int32) for _ in range(2))
         self._falling_roots = np.zeros(0, np.int32)
@@ -328,6 +331,8 @@ class ArticulationSolver:
                 "tie_stiffness": ties.stiffness,
                 "tie_damping": ties.damping,
                 "tie_softening": ties.softening,
+                "tie_slip": ties.slip,
+                "tie_strength": ties.strength,
                 "tree_phi": self.phi,
                 "phi_used": self.phi_used,
                 "tree_rate": self.tree_rate,
@@ -493,6 +498,7 @@ class ArticulationSolver:
             state.joint_xd[body] = state.body_qd[body, :3]
             state.joint_qd[body] = state.body_qd[body, 3:]
             state.body_cut[body] = True
+            state.joint_set[body] = frames.IDENTITY
 
     def _detach_joints(self, bodies: np.ndarray) -> None:
         """Read from the state which bodies are cut off. ``bodies``: all bodies of some trees."""
@@ -533,6 +539,22 @@ class ArticulationSolver:
         if not 0.0 < mass < math.inf:
             raise ValueError(f"body {body}: mass {mass} kg; leave a stub of a gram")
         self.berry_clusters.set_mass(body, mass)
+
+    def set_set(self, bodies: np.ndarray, kept: np.ndarray) -> None:
+        """Change the set (``State.joint_set``) of ``bodies`` [k] to ``kept`` [k, 4] xyzw. Their poses and velocities do
+        not change, only what their springs pull towards.
+
+        A body that has been cut off has no joint, and keeps no set.
+        """
+        state = self.state
+        bodies, kept = bodies[held := ~state.body_cut[bodies]], frames.normalize(np.asarray(kept, float)[held])
+        before = state.joint_set[bodies].astype(float)
+        turn = frames.multiply(frames.conjugate(kept), before)
+        state.joint_set[bodies] = kept
+        self._rest[bodies] = frames.normalize(frames.multiply(self.model.body_rest[bodies].astype(float), kept))
+        state.joint_q[bodies] = frames.normalize(frames.multiply(turn, state.joint_q[bodies].astype(float)))
+        state.joint_qd[bodies] = frames.rotate(turn, state.joint_qd[bodies].astype(float))
+        self.buffers.upload(["body_rest"])
 
     def set_inertia(self, body: int, mass: float, com: np.ndarray, inertia: np.ndarray) -> None:
         """Set mass [kg], centre of mass [3] m and moments of inertia about it [3] kg m^2 of one piece of wood, in its
@@ -735,6 +757,17 @@ class ArticulationSolver:
         tie = self.ties.add(body, point, self.state.body_q[body].astype(float), stiffness, damping)
         self._find_falling(self.bodies_of(np.array([tree])))
         return tie
+
+    def break_tie(self, tie: int) -> None:
+        """Let a tie of the model hold nothing any more (``State.tie_broken``). The tree does not wake."""
+        self.state.tie_broken[tie] = True
+        self.ties.release(tie)
+        self._find_falling(self.bodies_of(self.model.body_tree[self.model.tie_body[[tie]]]))
+
+    def slide_tie(self, tie: int, way: float) -> None:
+        """Move a tie of the model by ``way`` [m] along its wire (``State.tie_slid``)."""
+        self.state.tie_slid[tie] += way
+        self.ties.slide(tie, way * self.ties.axis[tie])
 
     def remove_tie(self, body: int, tie: int) -> None:
         """Remove a tie that :meth:`add_tie` added."""
@@ -2028,6 +2061,43 @@ class KernelLaunches:
             buffers.reach(carried, wp.spatial_vector, "joint_wrench"),
         )
         return JointWrenches(places, count, carried, launch)
+
+    def wood_stress(
+        self,
+        wood: WoodStrength,
+        capacity: wp.array,
+        is_held: wp.array,
+        patience: int,
+        watch: wp.array,
+        stress: wp.array,
+        largest: wp.array,
+    ) -> KernelGraph:
+        """Returns the launch that finds the stress in the wood of the trees of the last step. Arguments: see
+        :func:`vinesim.kernels.plants.wood_stress.find_stress`."""
+        return self.graph(
+            self.launch(
+                find_stress,
+                self.parameters,
+                self._model,
+                wood,
+                capacity,
+                self.count(_STEPPING),
+                "stepping",
+                "phi_used",
+                "tree_steps",
+                self._forces,
+                self._bodies,
+                "body_acceleration",
+                self.fill(structs.JointState),
+                "tree_rate",
+                is_held,
+                patience,
+                watch,
+                "subtree_wrench",
+                stress,
+                largest,
+            )
+        )
 
 
 # Launches over the awake trees: in groups of one topology on a CPU, captured into a graph on a GPU.

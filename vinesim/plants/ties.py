@@ -9,6 +9,7 @@ hold it.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -61,6 +62,10 @@ class TieTable:
         """[tie] N/m stiffness; a tie of zero stiffness does nothing."""
         self.damping = np.append(model.tie_damping, np.zeros(room, np.float32))
         """[tie] N s/m: damping of each tie."""
+        self.slip = np.append(_endless(model.tie_slip), np.full(room, np.inf, np.float32))
+        """[tie] N: force along the wire at which each tie slips; infinity: never."""
+        self.strength = np.append(_endless(model.tie_strength), np.full(room, np.inf, np.float32))
+        """[tie] N: force at which each tie breaks; infinity: never."""
         self.point = np.append(model.tie_point, np.zeros((room, 3), np.float32), 0)
         """[tie, 3] m, in the body's frame: the point of the body at which the tie acts."""
         ends = np.searchsorted(model.tie_body, np.arange(bodies + 1)).astype(np.int32)
@@ -71,6 +76,8 @@ class TieTable:
         """Ties of the model that are bound to wires under tension [k], sorted."""
         self._model_span = self.span.copy()
         self._slot_of: dict[int, int] = {}
+        self.on_slide: Callable[[int, np.ndarray], None] = lambda tie, way: None
+        """Called with a tie of the model that slides and its way [3] m, by those who place its anchor."""
 
     @property
     def held_bodies(self) -> list[int]:
@@ -108,6 +115,29 @@ class TieTable:
             else:
                 self.span[one] = self._model_span[one]
         self.changes += 1
+
+    @property
+    def tied_bodies(self) -> np.ndarray:
+        """Bodies with ties that hold them [k]."""
+        holds = self.stiffness[: self._model_ties] > 0.0
+        return np.append(np.unique(self.tie_body[holds]), np.array(self.held_bodies, np.int32))
+
+    def rows_of(self, tie: int) -> list[int]:
+        """Returns the rows of a tie of the model: its own, and its copy if hands hold the body."""
+        body = int(self.tie_body[tie])
+        here = int(self.span[body, 0]) + tie - int(self._model_span[body, 0])
+        return [tie] if here == tie else [tie, here]
+
+    def release(self, tie: int) -> None:
+        """Let a tie of the model hold nothing any more."""
+        rows = self.rows_of(tie)
+        self.stiffness[rows] = self.damping[rows] = 0.0
+
+    def slide(self, tie: int, way: np.ndarray) -> None:
+        """Move the anchor of a tie of the model by ``way`` [3] m."""
+        rows = self.rows_of(tie)
+        self.anchor[rows] += way.astype(np.float32)
+        self.on_slide(tie, way)
 
     def add(self, body: int, point: np.ndarray, pose: np.ndarray, stiffness: float, damping: float) -> int:
         """Tie the point ``point`` [3] m of a body's frame to its present place in the world. ``pose`` [7]: world pose
@@ -187,8 +217,15 @@ class TieTable:
             self.softening,
             self.stiffness,
             self.damping,
+            self.slip,
+            self.strength,
             self.point,
         )
+
+
+def _endless(force: np.ndarray) -> np.ndarray:
+    """Returns forces [k] with infinity in place of 0."""
+    return np.where(force > 0.0, force, np.inf).astype(np.float32)
 
 
 class RootRests:

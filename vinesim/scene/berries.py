@@ -41,6 +41,8 @@ class Variety:
     bunch_mass_range: tuple[float, float] | None = None
     peduncle_length: tuple[float, float] | None = None
     """Smallest and largest length of the bunch's stalk [m]."""
+    peduncle_pull: tuple[float, float] | None = None
+    """Range of the pulling forces [N] at which the stalk breaks; see ``Peduncle.pull``."""
     style: Style = "table"
     """How the berries are packed."""
     leaf_area: float | None = None

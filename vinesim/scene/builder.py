@@ -41,6 +41,12 @@ class RodMaterial:
     """Stiffness-proportional damping beta [s]: joint damping = beta * joint stiffness."""
     shear_modulus: float | None = None
     """Shear modulus G [Pa]; E / 2.6 (Poisson 0.3) unless given."""
+    strength: float = 0.0
+    """Modulus of rupture [Pa]; 0: the rod never breaks."""
+    yield_strength: float = 0.0
+    """Stress [Pa] above which the rod keeps a set; 0: none before it cracks."""
+    toughness: float = 1e4
+    """[J/m^2] Work that breaks a cracked rod through, for each unit of its cross-section."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -213,7 +219,15 @@ class TreeBuilder:
                 unless given.
         """
         sizes = as_numbers([length, *radius, material.modulus, material.density])
-        losses = as_numbers([material.damping, material.shear_modulus or 0.0])
+        losses = as_numbers(
+            [
+                material.damping,
+                material.shear_modulus or 0.0,
+                material.strength,
+                material.yield_strength,
+                material.toughness,
+            ]
+        )
         sound = np.isfinite(sizes).all() and (sizes > 0.0).all() and np.isfinite(losses).all() and (losses >= 0.0).all()
         if not (sound and is_whole(segments) and segments >= 1):
             raise ValueError(
@@ -268,6 +282,9 @@ class TreeBuilder:
                 damping=dampings[i],
                 far=far[i],
                 beta=material.damping,
+                strength=material.strength,
+                yield_strength=material.yield_strength,
+                toughness=material.toughness,
             )
             numbers.append(parent)
         return numbers
@@ -400,8 +417,9 @@ class TreeBuilder:
             body["rest"], body["settled"] = rest.astype(float), settled.astype(float)
 
 
+_BODY_FIELDS = ("organ", "offset", "rest", "mass", "com", "inertia", "length", "radius", "drag")
 _POSITIVE = ("mass", "inertia", "length")
-_NOT_NEGATIVE = ("radius", "stiffness", "damping", "drag", "far", "beta")
+_NOT_NEGATIVE = ("radius", "stiffness", "damping", "drag", "far", "beta", "strength", "yield_strength", "toughness")
 _FIELDS = {"offset", "rest", "organ", "com", "settled", *_POSITIVE, *_NOT_NEGATIVE}
 
 
@@ -548,7 +566,7 @@ def assemble(trees: list[TreeBuilder], **others: np.ndarray) -> Model:
             parent = i - 1 if body["parent"] is None else body["parent"]
             model.body_tree[at] = number
             model.body_parent[at] = first + parent if parent >= 0 else -1
-            for key in ("organ", "offset", "rest", "mass", "com", "inertia", "length", "radius", "drag"):
+            for key in (*_BODY_FIELDS, "strength", "yield_strength", "toughness"):
                 if key in body:
                     getattr(model, f"body_{key}")[at] = body[key]
             for key in ("stiffness", "damping", "settled"):

@@ -45,6 +45,12 @@ class CaneBuilder:
     """[Pa] Shear modulus G of torsion; E / 2.6 (Poisson's ratio 0.3) unless given."""
     density: float = 800.0
     """[kg/m^3] Density of the wood."""
+    strength: float = 0.0
+    """[Pa] Modulus of rupture: stress at which the wood cracks when it is bent; 0: it never breaks."""
+    yield_strength: float = 0.0
+    """[Pa] Stress above which the wood keeps a set; 0: none before it cracks."""
+    toughness: float = 1e4
+    """[J/m^2] Work that breaks cracked wood through, for each unit of its cross-section."""
     segments: int = 16
     """Number of rigid bodies of the cane."""
     tip_mass: float = 0.0
@@ -75,7 +81,14 @@ class CaneBuilder:
     @functools.cached_property
     def _undamped(self) -> TreeBuilder:
         tree = TreeBuilder(np.asarray(self.pose, float))
-        material = RodMaterial(self.youngs_modulus, self.density, shear_modulus=self.shear_modulus)
+        material = RodMaterial(
+            self.youngs_modulus,
+            self.density,
+            shear_modulus=self.shear_modulus,
+            strength=self.strength,
+            yield_strength=self.yield_strength,
+            toughness=self.toughness,
+        )
         turns = None if self.bends is None else frames.exp(np.asarray(self.bends, float))
         with plausibility.unchecked():  # tree() checks the numbers under the user's names
             tree.add_rod(-1, self.length, self._radii, material, self.segments, bends=turns)
@@ -146,7 +159,8 @@ class CaneBuilder:
         for name, value in numbers.items():
             if not (is_number(value) and value > 0.0):
                 raise ValueError(f"cane: {name} is {value}; give a finite number above 0")
-        for name, value in {"tip_mass": self.tip_mass, "damping_ratio": self.damping_ratio, "beta": self.beta}.items():
+        not_negative = ("tip_mass", "damping_ratio", "beta", "strength", "yield_strength", "toughness")
+        for name, value in {name: getattr(self, name) for name in not_negative}.items():
             if value is not None and not (is_number(value) and value >= 0.0):
                 raise ValueError(f"cane: {name} is {value}; give a finite number of 0 or more")
         if not is_whole(self.segments) or self.segments < 1:

@@ -69,6 +69,13 @@ class Model(StructOfArrays):
     """Radius at the origin and at the tip."""
     body_drag: np.ndarray = array("body", unit="m^2")
     """Drag area Cd A of leaves and wood; the wind force acts at the centre of mass."""
+    body_strength: np.ndarray = array("body", unit="Pa")
+    """Modulus of rupture of the wood of a cane: stress in the outermost fibre at the joint at which it cracks. 0: it
+    never breaks."""
+    body_yield_strength: np.ndarray = array("body", unit="Pa")
+    """Stress in the outermost fibre above which the wood keeps a set; 0: it keeps none before it cracks."""
+    body_toughness: np.ndarray = array("body", unit="J/m^2")
+    """Work that breaks the wood through, for each unit of its cross-section, after it has cracked."""
     joint_stiffness: np.ndarray = array("body", 3, unit="N m/rad")
     """Joint stiffness about the joint frame's axes: torsion, bending, bending."""
     joint_damping: np.ndarray = array("body", 3, unit="N m s/rad")
@@ -113,6 +120,10 @@ class Model(StructOfArrays):
     """Index (into ``fixed_start``) of the piece of wire that holds the tie; -1: the anchor does not move."""
     tie_stiffness: np.ndarray = array("tie", unit="N/m")
     tie_damping: np.ndarray = array("tie", unit="N s/m")
+    tie_slip: np.ndarray = array("tie", unit="N")
+    """Force along its wire at which a tie slips; 0: it never slips."""
+    tie_strength: np.ndarray = array("tie", unit="N")
+    """Force at which a tie breaks, or lets go of its wire; 0: it never breaks."""
 
     # leaves are fixed to bodies; visible to sensors, in physics only as drag and mass
     leaf_body: np.ndarray = array("leaf", unit="1", dtype=np.int32)

@@ -76,6 +76,13 @@ class Cane(_Part, frozen=True, kw_only=True):
     lateral_length: Annotated[Range, "m"]
     lateral_diameter: Annotated[Number, "m"]
     drag: Annotated[Number, "1"]
+    woody_strength: Annotated[Number, "Pa"] = Number(90e6, "Pa", "GUESSED", "as in vine.toml")
+    """Modulus of rupture of the woody base; of green wood: ``green_strength``. See ``Model.body_strength``."""
+    green_strength: Annotated[Number, "Pa"] = Number(45e6, "Pa", "GUESSED", "as in vine.toml")
+    yield_share: Annotated[Number, "1"] = Number(0.65, "1", "GUESSED", "as in vine.toml")
+    """Ratio of the stress above which wood keeps a set to its modulus of rupture."""
+    toughness: Annotated[Number, "J/m^2"] = Number(1e4, "J/m^2", "GUESSED", "as in vine.toml")
+    """Work that breaks cracked wood through, for each unit of its cross-section."""
     lateral_place: Annotated[Range, "1"] = Range((6 / 14, 11 / 14), "1", "GUESSED", "as in vine.toml")
     """Distance of a side shoot from the base of its shoot, as a share of the shoot's length."""
     lean_along: Annotated[Number, "1"] = Number(0.12, "1", "GUESSED", "shoots of a hedge that was tucked in carefully")
@@ -95,6 +102,7 @@ class Peduncle(_Part, frozen=True, kw_only=True):
     density: Annotated[Number, "kg/m^3"]
     damping: Annotated[Number, "s"]
     pull: Annotated[Range, "N"]
+    """Pulling forces at which peduncles break: 5 % are weaker, 5 % are stronger; see :mod:`vinesim.scene.strength`."""
     bend_strength: Annotated[Number, "Pa"]
     slant: Annotated[Range, "1"] = Range((0.1, 1.2), "1", "GUESSED", "stalks lead a bunch out beside what it hangs at")
     """Least and greatest tangent of the angle between the upper half of the stalk and the vertical, where
@@ -170,6 +178,10 @@ class Trellis(_Part, frozen=True, kw_only=True):
     tie_string: Annotated[Number, "m"]
     tie_stiffness: Annotated[Number, "N/m"]
     tie_damping: Annotated[Number, "s"]
+    tie_slip: Annotated[Number, "N"] = Number(10.0, "N", "GUESSED", "as in vine.toml")
+    """Force along its wire at which a tie slips."""
+    tie_strength: Annotated[Number, "N"] = Number(60.0, "N", "GUESSED", "as in vine.toml")
+    """Force at which a tie breaks, or lets go of its wire."""
 
 
 class Specimen(_Part, frozen=True, kw_only=True):
@@ -238,6 +250,8 @@ class Berry(_Part, frozen=True, kw_only=True):
     compactness: Annotated[Number | None, "1"] = None
     """Density of the bunch, note of OIV descriptor 204: 1 very loose, 9 very dense."""
     peduncle_length: Annotated[Range | None, "m"] = None
+    peduncle_pull: Annotated[Range | None, "N"] = None
+    """As ``Peduncle.pull``."""
     leaf_area: Annotated[Number | None, "m^2"] = None
     sinus_depth: Annotated[Number | None, "1"] = None
     """Depth of the leaf's upper lateral sinuses, note of OIV descriptor 094: 1 very shallow, 9 very deep."""

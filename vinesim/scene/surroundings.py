@@ -85,8 +85,14 @@ class Tie:
     """[N/m]"""
     damping: float = 20.0
     """[N s/m]"""
+    slip: float = 0.0
+    """[N] Force along its wire at which the tie slips; 0: it never slips."""
+    strength: float = 0.0
+    """[N] Force at which the tie breaks; 0: it never breaks."""
 
     def __post_init__(self) -> None:
+        checked_number("tie: slip", self.slip, "N")
+        checked_number("tie: strength", self.strength, "N")
         checked_number("tie: along", self.along, "m")
         checked_number("tie: stiffness", self.stiffness, "N/m", positive=True)
         checked_number("tie: damping", self.damping, "N s/m")
@@ -128,6 +134,8 @@ def surroundings(plants: Model, wires: Sequence[Wire], ties: Sequence[Tie], boxe
         "tie_wire": [-1 if tie.wire is None else tie.wire for tie in tied],
         "tie_stiffness": [tie.stiffness for tie in tied],
         "tie_damping": [tie.damping for tie in tied],
+        "tie_slip": [tie.slip for tie in tied],
+        "tie_strength": [tie.strength for tie in tied],
     }
 
 

@@ -48,6 +48,9 @@ class ElasticSupports:
         arms = _arm_nodes(plants)
         plants.ties.axis[wires["tie"]] = wires["axis"]
         nodes = {name: np.concatenate([wires[name], arms[name]]) for name in wires}
+        self._origin = nodes["origin"]
+        self._node_of = {tie: node for node, tie in enumerate(wires["tie"].tolist())}
+        plants.ties.on_slide = self._slide
         first = np.flatnonzero(np.diff(nodes["support"], prepend=-1))
         self._tree = model.body_tree[nodes["body"]].astype(np.int32)
         self._support = np.repeat(np.arange(len(first)), np.diff(np.append(first, len(self._tree))))
@@ -167,6 +170,11 @@ class ElasticSupports:
         self._solve = KernelGraph(solve)
         self.wire_structs = SharedArrays(kernels.Wires, **wires).struct, node_struct, body_struct, spring_struct
         """Arguments of :func:`kernels.wire_spring`, except the loads."""
+
+    def _slide(self, tie: int, way: np.ndarray) -> None:
+        """Let a tie that slips along its wire hold it further on. The node's place in the wire's equations stays."""
+        if tie in self._node_of:
+            self._origin[self._node_of[tie]] += way
 
     def set_loaded(self, supports: np.ndarray) -> None:
         """Set the supports (wires or arms) [k] on which :attr:`load` acts until the next call."""

@@ -13,13 +13,14 @@ import numpy as np
 from vinesim.interaction.support_tracking import GROUND
 from vinesim.net.codec.control import RetainedRecord
 from vinesim.net.codec.trees import decode_trees
+from vinesim.net.codec.wood import decode_wood, encode_wood
 from vinesim.net.replication import dead_reckoning
 from vinesim.net.replication.authority import wins
 from vinesim.net.replication.receiver import Inbox
 from vinesim.net.replication.streams import NO_ROOTS, DetachedRoots
 from vinesim.scene.ids import ObjectKind, is_tree, object_id, parse_object_name, split_object_id
 from vinesim.scene.spare_bodies import PLACE_STEP
-from vinesim.scene.values import Detachment, ObjectUpdate, TreeUpdate
+from vinesim.scene.values import Breakage, Detachment, GivenWood, ObjectUpdate, TreeUpdate
 from vinesim.world import Physics
 
 BLEND_PER_STEP = 0.2
@@ -32,6 +33,8 @@ FAR_ANGLE = 0.1
 that a hand has slipped off the copy or the original. Below it the share is interpolated. TUNED."""
 ACTIVATION_PERIOD = 20
 """Ticks between two activations of dormant bunches."""
+WOOD_PERIOD = 0.25
+"""Longest time [s] after which the record of a tree whose wood gives is published again."""
 CARRIED_DISTANCE = 3.0
 """Distance over which an actor carries a resting object before the object's record is published again [m]. It is half a
 cell, so that clients that join later receive the record from the cells around them."""
@@ -61,6 +64,11 @@ class ObjectSync:
         self._cut_bodies: dict[int, list[int]] = {}
         """Bodies that were cut off each tree, ascending."""
         self._detachments: tuple[Detachment, ...] = ()
+        self._breakages: tuple[Breakage, ...] = ()
+        self._given_since: dict[int, int] = {}
+        """Tick in which the wood or ties of each tree first gave since the tree's last record."""
+        self._given: list[int] = []
+        """Trees whose records are to be published because their wood or ties gave."""
 
     # ------------------------------------------------------------------ received
 
@@ -89,6 +97,7 @@ class ObjectSync:
         for record, holds in records:
             if is_tree(record.object):
                 self._apply_cuts(record)
+                self._apply_wood(record)
             elif record.stalk is not None:
                 self._apply_stalk(record.object, *record.stalk)
             known = newest.get(record.object)
@@ -168,6 +177,32 @@ class ObjectSync:
         for body in record.cut:
             if self.physics.model.body_tree[body] == record.object and not self.physics.state.body_cut[body]:
                 self.apply_remote_cut(body)
+
+    def _apply_wood(self, record: RetainedRecord) -> None:
+        """Let the wood and ties of a tree give as they have given on the client that owned it."""
+        if not record.wood:
+            return
+        self._changed_trees.add(record.object)
+        self.physics.apply_remote_wood(record.object, decode_wood(record.wood))
+
+    def wood_of(self, tree: int) -> bytes:
+        """Returns how the wood and ties of a tree have given, as its record states it."""
+        model = self.physics.model
+        state = self.physics.state
+        bodies = model.bodies_of(tree)
+        joints = np.flatnonzero((state.joint_flow[bodies] > 0.0) & ~state.body_cut[bodies])
+        ties = np.flatnonzero(model.body_tree[model.tie_body] == tree)
+        gave = np.flatnonzero(state.tie_broken[ties] | (state.tie_slid[ties] != 0.0))
+        own = bodies.start + joints
+        given = GivenWood(
+            joints,
+            state.joint_set[own],
+            state.joint_flow[own],
+            gave,
+            state.tie_slid[ties[gave]],
+            state.tie_broken[ties[gave]],
+        )
+        return encode_wood(given)
 
     def _apply_stalk(self, number: int, segment: int, steps: int) -> None:
         """Cut a bunch where its record names the cut, or give a bunch that was cut before its record came the stalk
@@ -286,7 +321,7 @@ class ObjectSync:
     def touched_blend(self, update: TreeUpdate) -> float:
         """Returns the share of the error by which :meth:`blend_tree` shall correct a tree in one step while an actor of
         this client touches the tree."""
-        here = self.physics.state.joint_q[self.physics.model.bodies_of(update.tree)].astype(float)
+        here = self.physics.state.whole_turn(self.physics.model.bodies_of(update.tree)).astype(float)
         return touched_share(float(dead_reckoning.angle_between(here, update.joint_q).max()))
 
     def blend_tree(self, update: TreeUpdate, blend: float, rate_blend: float = 1.0) -> None:
@@ -307,7 +342,8 @@ class ObjectSync:
             state.joint_xd[body] = xd
         here = self.physics.model.bodies_of(update.tree)
         rates = state.joint_qd[here] + rate_blend * (update.joint_qd - state.joint_qd[here])
-        plants.blend_towards(update.tree, update.joint_q, rates if rate_blend < 1.0 else update.joint_qd, blend)
+        turned = state.elastic_turn(here, update.joint_q)
+        plants.blend_towards(update.tree, turned, rates if rate_blend < 1.0 else update.joint_qd, blend)
 
     # ------------------------------------------------------------------ to send
 
@@ -319,12 +355,26 @@ class ObjectSync:
             self._changed_trees.add(detachment.tree)
             if detachment.bunch < 0:
                 self._record_cut(detachment.body)
+        monitor = self.physics.detachment_monitor
+        self._breakages = monitor.breakages
+        for tree in monitor.wood.given:
+            self._changed_trees.add(tree)
+            self._given_since.setdefault(tree, self.physics.tick)
+        period = self.physics.parameters.steps(WOOD_PERIOD)
+        due = {tree for tree, since in self._given_since.items() if self.physics.tick - since >= period}
+        self._given = sorted(due | {one.tree for one in self._breakages})
+        for tree in self._given:
+            self._given_since.pop(tree, None)
 
     def detached_by(self, name: str, *, all_others: bool) -> list[int]:
-        """Returns the objects that actor ``name`` detached in the last step; with ``all_others`` also objects that no
-        local actor detached."""
+        """Returns the objects that actor ``name`` detached in the last step, and the trees whose wood or ties it broke;
+        with ``all_others`` also those that no local actor changed."""
         mine = [p for p in self._detachments if p.actor == name or (all_others and p.actor not in self._local_actors)]
         numbers = [object_id(ObjectKind.BUNCH, p.bunch) if p.bunch >= 0 else p.tree for p in mine]
+        actor = {one.tree: one.actor for one in self._breakages}
+        for tree in self._given:
+            mine = actor.get(tree, "") == name or (all_others and actor.get(tree, "") not in self._local_actors)
+            numbers += [tree] if mine and tree not in numbers else []
         return [number for number in numbers if is_tree(number) or number in self.physics.support_tracker]
 
     def forget(self, number: int) -> None:
@@ -396,7 +446,7 @@ class ObjectSync:
             return self.physics.support_tracker.object_state(number)
         here = self.physics.model.bodies_of(number)
         state = self.physics.state
-        return state.joint_q[here], state.joint_qd[here]
+        return state.whole_turn(here), state.joint_qd[here]
 
     def cut_roots(self, tree: int) -> DetachedRoots:
         """Returns the bodies that were cut off a tree, for :meth:`Replicator.send`."""

@@ -113,7 +113,7 @@ class TreeCopies:
     def _correct_once(self, copy: _Copy, is_pressed: bool) -> None:
         """Rotate the joints by a share of the error that the last state revealed, until that error is corrected."""
         update = copy.update
-        here = self.physics.state.joint_q[self.physics.model.bodies_of(update.tree)].astype(float)
+        here = self.physics.state.whole_turn(self.physics.model.bodies_of(update.tree)).astype(float)
         if copy.is_new:
             copy.correction = frames.log(frames.multiply(frames.conjugate(here), update.joint_q))
         away = float(np.sqrt((copy.correction * copy.correction).sum(1).max()))

@@ -23,6 +23,7 @@ from vinesim.net.codec.json_values import COUNT, NUMBER, POSE, TEXT, THING, YES,
 from vinesim.net.codec.objects import check_object_id
 from vinesim.net.codec.robot import MAX_JOINTS
 from vinesim.net.codec.trees import MAX_BODIES, MAX_TREES
+from vinesim.net.codec.wood import decode_wood
 from vinesim.net.pace import MIN_FACTOR, PaceReport
 from vinesim.net.replication.authority import Claim
 from vinesim.scene.ids import LABEL_STRIDE
@@ -130,6 +131,8 @@ class RetainedRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknow
     stumps: tuple[tuple[int, int, int], ...] = ()
     """Stumps that cuts of the tree's canes have left, in increasing order: body of the stump, segment that was cut, and
     place of the cut along it [0.1 mm]."""
+    wood: bytes = b""
+    """For a tree whose wood or ties have given: encoded by :func:`vinesim.net.codec.wood.encode_wood`."""
 
     @property
     def claim(self) -> Claim:
@@ -263,6 +266,8 @@ def decode_records(payload: bytes, counts: tuple[int, ...] | None = None) -> lis
             body < 0 or segment < 0 or not 0 < place < 1 << 16 for body, segment, place in record.stumps
         ):
             raise MessageError(f"record of object {record.object} with impossible stumps {record.stumps[:4]}")
+        if record.wood:
+            decode_wood(record.wood)
     return records
 
 

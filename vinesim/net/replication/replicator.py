@@ -223,6 +223,7 @@ class Replicator:
         carried_on: Iterable[int] = (),
         stalk_of: Callable[[int], tuple[int, int] | None] = lambda _: None,
         stumps_of: Callable[[int], tuple[tuple[int, int, int], ...]] = lambda _: (),
+        wood_of: Callable[[int], bytes] = lambda _: b"",
     ) -> list[TreeUpdate]:
         """Publish the results of one step. Returns the states of trees at rest that were sent, as all receivers decode
         them.
@@ -247,6 +248,8 @@ class Replicator:
         * ``stalk_of(object_id)``: where a bunch was cut in its peduncle
           (:attr:`vinesim.net.codec.control.RetainedRecord.stalk`).
         * ``stumps_of(tree)``: the stumps of a tree (:attr:`vinesim.net.codec.control.RetainedRecord.stumps`).
+        * ``wood_of(tree)``: how the wood and ties of a tree have given
+          (:attr:`vinesim.net.codec.control.RetainedRecord.wood`).
         """
         state = self._state
         self._follow_clock()
@@ -276,6 +279,7 @@ class Replicator:
                 carried_on,
                 stalk_of,
                 stumps_of,
+                wood_of,
             )
         )
 

@@ -59,6 +59,7 @@ class LocalStep:
     carried_on: set[int]
     stalk_of: Callable[[int], tuple[int, int] | None]
     stumps_of: Callable[[int], tuple[tuple[int, int, int], ...]]
+    wood_of: Callable[[int], bytes]
 
 
 class Sender:
@@ -346,10 +347,13 @@ class Sender:
         state.retained.publish(state.object_stream.cells((object_id,))[0], record)
 
     def _publish_tree_record(self, cell: Cell, record: RetainedRecord, step: LocalStep) -> None:
-        """Add all bodies that were cut off a tree, and all stumps, to its retained record, and publish the record."""
+        """Add all bodies that were cut off a tree, all stumps, and how its wood has given, to its retained record, and
+        publish the record."""
         first = int(self._state.model.tree_first[record.object])
         cut = tuple((first + step.detached_roots(record.object)[0]).tolist())
-        record = msgspec.structs.replace(record, cut=cut, stumps=step.stumps_of(record.object))
+        record = msgspec.structs.replace(
+            record, cut=cut, stumps=step.stumps_of(record.object), wood=step.wood_of(record.object)
+        )
         self._state.retained.publish(cell, record)
 
     def _encode_tree(self, tree: int, claim: Claim, step: LocalStep, flags: int) -> tuple[bytes, TreeUpdate]:

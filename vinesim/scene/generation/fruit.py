@@ -14,6 +14,7 @@ from vinesim.scene.generation.fixed_structure import FixedStructure
 from vinesim.scene.generation.shoot_slots import AXIS_SEGMENTS, MAX_BUNCHES, PEDUNCLE_SEGMENTS
 from vinesim.scene.plant_parameters import Bunch, Range, VineParameters
 from vinesim.scene.spec import Scene
+from vinesim.scene.strength import peduncle_strength
 
 Sampler = Callable[..., np.ndarray]
 """Function that returns random numbers [shoot, *shape] for a given ``shape``. Each shoot uses the random number
@@ -70,6 +71,8 @@ def sample_fruit(
     volume_radius = np.array([v.volume_radius for v in berries.VARIETIES])[variety]
     size = volume_radius * portable_math.cbrt(juice / (count * berry_mass))
     hull = berries.hull_size(count, seed, variety) * size[..., None]
+    weak, strongest = np.array([v.peduncle_pull or peduncle.pull.value for v in berries.VARIETIES]).T[:, variety]
+    pull, strong = peduncle_strength(uniform(MAX_BUNCHES), weak, strongest)
     drawn = {
         "mass": mass,
         "count": count,
@@ -77,7 +80,8 @@ def sample_fruit(
         "radius": hull[..., 1],
         "seed": seed,
         "variety": variety,
-        "pull": peduncle.pull.at(uniform(MAX_BUNCHES)),
+        "pull": pull,
+        "strong": strong,
         "thick": 0.5 * peduncle.diameter.at(np.maximum(_fraction(mass, fruit.mass_range), _THINNEST)),
     }
 

@@ -70,6 +70,8 @@ class Bodies:
     """[shoot, slot, 3] N m s/rad, damping of the body's joint."""
     drag: np.ndarray
     """[shoot, slot] m^2, drag area Cd A."""
+    strength: np.ndarray
+    """[shoot, slot] Pa, modulus of rupture of canes; 0 for all other bodies."""
     head: dict[str, np.ndarray]
     """[shoot, MAX_BUNCHES, ...] mass, com and inertia of the head of each bunch, the part outside its clusters."""
 
@@ -87,6 +89,9 @@ def build_bodies(parameters: VineParameters, shoots: Shoots) -> Bodies:
     woody = math.log(cane.woody_modulus.value)
     soft = math.log(cane.green_modulus.value)
     modulus = portable_math.exp(woody * (1.0 - green) + soft * green)
+    woody, soft = math.log(cane.woody_strength.value), math.log(cane.green_strength.value)
+    bodies.strength[:, :AXIS_SEGMENTS] = portable_math.exp(woody * (1.0 - green) + soft * green)
+    bodies.strength[:, LATERAL_SLOTS] = cane.green_strength.value
     parent = np.broadcast_to(np.arange(-1, AXIS_SEGMENTS - 1), (count, AXIS_SEGMENTS))
     _fill_rod(bodies, slice(0, AXIS_SEGMENTS), shoots.points, radius, modulus, cane, shoots.up, parent)
 
@@ -134,6 +139,7 @@ def _allocate(count: int) -> Bodies:
         half=np.zeros((*shape, 3)),
         damping=np.zeros((*shape, 3)),
         drag=np.zeros(shape),
+        strength=np.zeros(shape),
         head={
             "mass": np.zeros((count, MAX_BUNCHES)),
             "com": np.zeros((count, MAX_BUNCHES, 3)),

@@ -66,6 +66,8 @@ def find_ties(
         "wire": _nearest_wire(structure, anchor, 1 - which if tendone else 0 * which),
         "stiffness": np.full(len(slot), stiffness),
         "damping": np.full(len(slot), trellis.tie_damping.value * stiffness),
+        "slip": np.full(len(slot), trellis.tie_slip.value),
+        "strength": np.full(len(slot), trellis.tie_strength.value),
     }
 
 

@@ -38,6 +38,7 @@ from vinesim.scene.plant_import.wood import build_model, join_models
 from vinesim.scene.plant_parameters import VineParameters
 from vinesim.scene.spare_bodies import with_spares
 from vinesim.scene.spec import Clutter, Datum, Scene, Sun, Wind
+from vinesim.scene.strength import with_reserve
 from vinesim.scene.terrain import Terrain, ground_height
 
 
@@ -114,7 +115,7 @@ def _generate(scene: Scene, parameters: VineParameters, terrain: Terrain | None)
         for i, box in enumerate(scene.boxes):
             half = 0.5 * box.size[0], 0.5 * box.size[1]
             model.box_pose[i] = terrain.resting_pose(box.x, box.y, box.yaw, half)
-    model = builder.solve_rest_pose(model).check()
+    model = with_reserve(builder.solve_rest_pose(model)).check()
     model.look = Look.of(scene)
     variety = [v.name for v in berries.VARIETIES].index(scene.fruit.varieties[0])
     for number, one in enumerate(scene.imported):
@@ -184,8 +185,10 @@ def _assemble_model(
     drawn = frames.compose(frames.inverse(base), frames.pose(bodies.origin, bodies.turn)[has])
     model.body_offset[:] = drawn[:, :3]
     model.body_rest[:] = frames.normalize(drawn[:, 3:])
-    for name in ("organ", "mass", "com", "inertia", "length", "radius", "drag"):
+    for name in ("organ", "mass", "com", "inertia", "length", "radius", "drag", "strength"):
         getattr(model, f"body_{name}")[:] = getattr(bodies, name)[has]
+    model.body_yield_strength[:] = parameters.cane.yield_share.value * model.body_strength
+    model.body_toughness[:] = np.where(model.body_strength > 0.0, parameters.cane.toughness.value, 0.0)
     model.joint_stiffness[:] = bodies.stiffness[has]
     model.joint_damping[:] = bodies.damping[has]
 
@@ -194,7 +197,8 @@ def _assemble_model(
     model.bunch_berries[:] = fruit["count"]
     for name in ("length", "radius", "seed", "variety", "pull"):
         getattr(model, f"bunch_{name}")[:] = fruit[name]
-    model.bunch_bend[:] = parameters.peduncle.bend_strength.value * np.pi / 4.0 * portable_math.power(fruit["thick"], 3)
+    strength = parameters.peduncle.bend_strength.value * fruit["strong"]
+    model.bunch_bend[:] = strength * np.pi / 4.0 * portable_math.power(fruit["thick"], 3)
     model.bunch_cluster[:] = np.stack([number[:, cluster_slots(k).start] for k in range(MAX_BUNCHES)], 1)[
         shoots.has_bunch
     ]
@@ -205,7 +209,7 @@ def _assemble_model(
         getattr(model, f"bunch_head_{name}")[:] = head[shoots.has_bunch]
 
     model.tie_body[:] = number[ties["shoot"], ties["slot"]]
-    for name in ("point", "anchor", "wire", "stiffness", "damping"):
+    for name in ("point", "anchor", "wire", "stiffness", "damping", "slip", "strength"):
         getattr(model, f"tie_{name}")[:] = ties[name]
 
     model.leaf_body[:] = carrier

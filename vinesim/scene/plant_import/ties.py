@@ -60,6 +60,8 @@ def tie_to_wires(plant: Model, vineyard: Model, gap: float, trellis: Trellis) ->
     ties.tie_anchor[:] = np.stack(anchor, 1)
     ties.tie_stiffness[:] = trellis.tie_stiffness.value
     ties.tie_damping[:] = trellis.tie_damping.value * trellis.tie_stiffness.value
+    ties.tie_slip[:] = trellis.tie_slip.value
+    ties.tie_strength[:] = trellis.tie_strength.value
     fields = {name: getattr(ties, name) for name in Model.array_fields() if name.startswith("tie_")}
     return dataclasses.replace(plant, **fields).check()
 

@@ -16,6 +16,7 @@ from vinesim.scene.model import Model
 from vinesim.scene.plant_import.imported_plant import ImportedPlant, Wood
 from vinesim.scene.plant_parameters import Cane, Leaf, VineParameters
 from vinesim.scene.spec import Scene
+from vinesim.scene.strength import with_reserve
 
 _SHORT = 0.3
 """Length of wood between two forks below which the wood is dropped and the forks are merged [piece lengths]."""
@@ -76,7 +77,7 @@ def build_model(
         fixed_organ=np.where(trunk[wood], int(Organ.TRUNK), int(Organ.ARM)),
         fixed_index=np.where(trunk[wood], 0, np.cumsum(~trunk[wood])),
     )
-    return builder.solve_rest_pose(model).check() if plant.shape == "drawn" and trees else model
+    return with_reserve(builder.solve_rest_pose(model)).check() if plant.shape == "drawn" and trees else model
 
 
 def join_models(first: Model, second: Model) -> Model:
@@ -187,12 +188,14 @@ def _tree(
     way = points.way
     longest = way[inside].max() - way[below]
     bodies = {below: -1}
+    cane = parameters.cane
     for node in np.flatnonzero(inside).tolist():
         before = int(points.parent[node])
         along = place[node] - place[before]
         turn = _turned(turns[before], along)
         share = (0.5 * (way[node] + way[before]) - way[below]) / longest
         green = np.clip((share - wood.woody_share.value) / 0.2 + 0.5, 0.0, 1.0) if main[node] else 1.0
+        strength = float(cane.woody_strength.value ** (1.0 - green) * cane.green_strength.value**green)
         modulus = float(wood.woody_modulus.value ** (1.0 - green) * wood.green_modulus.value**green)
         # at its base a side shoot has the radius of the end of its first piece
         grown = main[before] == main[node] and before != below
@@ -202,7 +205,14 @@ def _tree(
             bodies[before],
             float(np.linalg.norm(along)),
             radius,
-            RodMaterial(modulus, wood.density.value, wood.damping.value),
+            RodMaterial(
+                modulus,
+                wood.density.value,
+                wood.damping.value,
+                strength=strength,
+                yield_strength=cane.yield_share.value * strength,
+                toughness=cane.toughness.value,
+            ),
             1,
             rest=frames.multiply(frames.conjugate(turns[before]), turn),
         )[0]

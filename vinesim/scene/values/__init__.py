@@ -52,7 +52,7 @@ from vinesim.scene.values.sensors import (
 )
 from vinesim.scene.values.signals import INTENTIONS, TONE_LEVEL, HandGestures, Intention, LightPattern, Lights
 from vinesim.scene.values.status import ComponentStatus
-from vinesim.scene.values.world import Contact, Detachment, SegmentPoses, Snapshot, WindState
+from vinesim.scene.values.world import Breakage, Contact, Detachment, GivenWood, SegmentPoses, Snapshot, WindState
 
 __all__ = [
     "FORWARD_KINDS",
@@ -63,6 +63,7 @@ __all__ = [
     "TONE_LEVEL",
     "Band",
     "Box",
+    "Breakage",
     "BunchTruth",
     "CameraFrame",
     "CameraInfo",
@@ -76,6 +77,7 @@ __all__ = [
     "Drive",
     "ElasticSample",
     "FixKind",
+    "GivenWood",
     "GnssFix",
     "GnssMount",
     "GripperState",

@@ -99,7 +99,8 @@ class Detachment:
     bunch: int
     """Index of the bunch, -1 for a cane."""
     cause: str
-    """``"pull"`` (too large force), ``"bend"`` (too large moment), ``"blade"`` (a cutter) or ``"command"``."""
+    """``"pull"``, ``"bend"`` or ``"twist"`` (the load that used most of the strength), ``"blade"`` (a cutter) or
+    ``"command"``."""
     actor: str
     """Name of the actor who caused the detachment; empty if unknown."""
     force: np.ndarray
@@ -112,3 +113,58 @@ class Detachment:
     """
     at: float = 0.0
     """[m] Distance of the cut from the origin of ``segment``."""
+    time: float = 0.0
+    """[s] Simulated time of the detachment. A break falls within a step."""
+    place: float = 0.0
+    """[m] Distance of the cut or break from the base of the tree, along the wood."""
+    point: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """[m] Place of the cut or break in the world."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Breakage:
+    """The event that something gave without parting: wood cracked, or a tie slipped or broke."""
+
+    kind: str
+    """``"crack"``: a cane has passed its strength and hangs on its fibres; ``"slip"``: a tie began to slip along its
+    wire; ``"untie"``: a tie broke."""
+    cause: str
+    """``"pull"``, ``"bend"`` or ``"twist"``."""
+    tick: int
+    time: float
+    """[s] Simulated time."""
+    tree: int
+    body: int
+    """Index of the body at whose joint the wood cracked, or which the tie held."""
+    tie: int
+    """Index of the tie, -1 for wood."""
+    actor: str
+    """Name of the actor who presses hardest on the tree; empty if none does."""
+    force: np.ndarray
+    """[3] N, force of the tree or the tie on the body, world axes."""
+    moment: np.ndarray
+    """[3] N m, moment about the joint on the body; 0 for a tie."""
+    place: float
+    """[m] Distance from the base of the tree along the wood."""
+    point: tuple[float, float, float]
+    """[m] Place in the world."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class GivenWood:
+    """How the wood and ties of one tree have given: joints [k] with a set, and ties [j] that have slipped or broken.
+
+    Places count from the tree's first body and the tree's first tie, and increase."""
+
+    joints: np.ndarray
+    """[k] int, places of the bodies."""
+    turns: np.ndarray
+    """[k, 4] float32, sets: unit quaternions xyzw."""
+    flows: np.ndarray
+    """[k] rad, float32: see ``State.joint_flow``."""
+    ties: np.ndarray
+    """[j] int, places of the ties."""
+    slid: np.ndarray
+    """[j] m, float32."""
+    broken: np.ndarray
+    """[j] bool"""
