@@ -128,7 +128,7 @@ class DetachmentMonitor:
         if not broken.is_crack:
             actor = self._hardest_pressing_actor(model.body_tree == model.body_tree[body])
             if not plants.state.body_cut[body]:
-                self._cut_joint(body, broken.cause, actor, broken.wrench)
+                self._cut_cane(body, broken.cause, actor, broken.wrench)
             return
         self._record_breakage(CRACK, broken.cause, body, broken.wrench, broken.late)
 
@@ -386,10 +386,10 @@ class DetachmentMonitor:
             return
         if plants.state.body_cut[body] and not at:
             raise ValueError(f"body {body} was cut already")
-        self._cut_joint(body, cause, actor, plants.joint_wrench(np.array([body]))[0])
+        self._cut_cane(body, cause, actor, plants.joint_wrench(np.array([body]))[0], at)
 
-    def _cut_joint(self, body: int, cause: str, actor: str, carried: np.ndarray) -> None:
-        """Part a cane at the joint between ``body`` and its parent."""
+    def _cut_cane(self, body: int, cause: str, actor: str, carried: np.ndarray, at: float | None = None) -> None:
+        """Part a cane ``at`` [m] from the origin of ``body``, or at the joint between ``body`` and its parent."""
         plants = self.plants
         tree = int(plants.model.body_tree[body])
         plants.wake(tree)
