@@ -181,8 +181,8 @@ def test_scene_protocol_and_actor_limit_of_the_server_are_enforced():
 def test_a_reply_of_another_protocol_is_refused_with_both_versions():
     with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
         newer = bytearray(encode_welcome(Welcome()))
-        newer[2] = 9
-        for answer, words in ((bytes(newer), "protocol version 9"), (b"junk", "cannot be decoded")):
+        newer[2] = PROTOCOL + 1
+        for answer, words in ((bytes(newer), f"protocol version {PROTOCOL + 1}"), (b"junk", "cannot be decoded")):
             # another program answers
             server._declared[1].undeclare()
             server._declared[1] = server._session.declare_queryable(
