@@ -24,7 +24,8 @@ from vinesim.client.faults import FaultLog, occurred
 from vinesim.core import frames, progress
 from vinesim.core.errors import UsageError, checked_index
 from vinesim.core.numbers import as_numbers, checked_vector, is_number, is_whole
-from vinesim.interaction.detachment import Blade
+from vinesim.interaction.blades import Blade
+from vinesim.interaction.cutting_force import BLADE_FACTORS
 from vinesim.kernels.compilation import PHYSICS_PACKAGES, compile_kernels
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot
@@ -38,7 +39,7 @@ from vinesim.scene.spec import Scene, load_scene
 from vinesim.scene.state import State
 from vinesim.scene.surroundings import Box, main_axis
 from vinesim.scene.terrain import Terrain, on_ground
-from vinesim.scene.values import Contact, Detachment, RigidBox, Snapshot
+from vinesim.scene.values import BladeClosing, Contact, Detachment, RigidBox, Snapshot
 from vinesim.scene.wind import Wind, wind_of
 from vinesim.wind.sway import Sway
 from vinesim.world import Physics
@@ -119,6 +120,7 @@ class Simulation:
         self._loads: dict[int, np.ndarray] = {}
         self._pushed: set[tuple[str, str]] = set()
         self._detachments: list[Detachment] = []
+        self._closings: list[BladeClosing] = []
         self._primitives: Primitives | None = None
         self._sway = Sway(model)
         self._fault_log = FaultLog(_warn_caller_of_step)
@@ -136,6 +138,7 @@ class Simulation:
             raise UsageError(f"count is {count}; give a whole number of steps, 0 or more")
         self._check_joints(self.physics.plants.awake)
         self._detachments = []
+        self._closings = []
         for name in self.robots.keys() - set(self.physics.rigid.robots):  # robots that are no longer in the physics
             self._forget_robot(name)
         for _ in range(count):
@@ -145,6 +148,7 @@ class Simulation:
                 pusher.control()
             self.physics.step()
             self._detachments += self.physics.detachments
+            self._closings += self.physics.closings
         for body, before in self._loads.items():
             self.physics.plants.body_load[body] = before
         if self._loads:  # a tree that fell asleep under its load must move again
@@ -196,6 +200,12 @@ class Simulation:
     def detachments(self) -> tuple[Detachment, ...]:
         """Bunches and canes that left their plant in the last call of :meth:`step`."""
         return tuple(self._detachments)
+
+    @property
+    def closings(self) -> tuple[BladeClosing, ...]:
+        """Closings of blades that ended in the last call of :meth:`step`: force, energy, depth, and why a blade did not
+        close."""
+        return tuple(self._closings)
 
     @property
     def faults(self) -> dict[str, int]:
@@ -403,9 +413,12 @@ class Simulation:
         pose: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
         *,
         size: Sequence[float],
+        force: float = np.inf,
+        speed: float = np.inf,
+        kind: Literal["bypass", "anvil", "saw"] = "bypass",
     ) -> Blade:
         """Attach a cutter to a robot's link, or to the link ``body`` of a pusher. :meth:`Blade.close` cuts the wood
-        between its blades in the next step. The cutters of a robot's files are there already
+        between its blades (:attr:`closings` has the result). The cutters of a robot's files are there already
         (:meth:`~vinesim.robot.drives.controlled_robot.Robot.cutter_blades`).
 
         Args:
@@ -413,6 +426,9 @@ class Simulation:
             link: name of its link.
             pose: [7] centre of the mouth in the link's frame: x along the blades, y from one blade to the other.
             size: [3] m, edges of the mouth along x, y and z.
+            force: [N] largest closing force. Blades stall in wood that takes more.
+            speed: [m/s] speed with which the edges approach each other. Infinite: they close within a step.
+            kind: ``bypass``, ``anvil`` or ``saw``.
         """
         if actor not in self.robots and actor not in self.pushers:
             there = ", ".join([*self.robots, *self.pushers]) or "none"
@@ -420,7 +436,13 @@ class Simulation:
         edges = checked_vector("size", size, "m", UsageError)
         if not (edges > 0.0).all():
             raise UsageError(f"size is {size}; give three edges above 0 [m]")
-        return self.physics.add_blade(actor, link, frames.checked_pose("pose", pose, UsageError), 0.5 * edges)
+        for name, value, unit in (("force", force, "N"), ("speed", speed, "m/s")):
+            if not (isinstance(value, (int, float)) and value > 0.0):
+                raise UsageError(f"{name} is {value!r}; give more than 0 {unit}")
+        if kind not in BLADE_FACTORS:
+            raise UsageError(f"kind is {kind!r}; give {', '.join(BLADE_FACTORS)}")
+        pose = frames.checked_pose("pose", pose, UsageError)
+        return self.physics.add_blade(actor, link, pose, 0.5 * edges, force=force, speed=speed, kind=kind)
 
     def add_box(self, box: Box) -> int:
         """Add an open box, which falls if nothing holds it, and return its number."""

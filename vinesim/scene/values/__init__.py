@@ -52,7 +52,7 @@ from vinesim.scene.values.sensors import (
 )
 from vinesim.scene.values.signals import INTENTIONS, TONE_LEVEL, HandGestures, Intention, LightPattern, Lights
 from vinesim.scene.values.status import ComponentStatus
-from vinesim.scene.values.world import Contact, Detachment, SegmentPoses, Snapshot, WindState
+from vinesim.scene.values.world import BladeClosing, Contact, Detachment, SegmentPoses, Snapshot, WindState
 
 __all__ = [
     "FORWARD_KINDS",
@@ -62,6 +62,7 @@ __all__ = [
     "SENSOR_KINDS",
     "TONE_LEVEL",
     "Band",
+    "BladeClosing",
     "Box",
     "BunchTruth",
     "CameraFrame",

@@ -104,3 +104,34 @@ class Detachment:
     """
     at: float = 0.0
     """[m] Distance of the cut from the origin of ``segment``."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class BladeClosing:
+    """The event that a blade has closed, or could not close wholly."""
+
+    tick: int
+    actor: str
+    link: str
+    outcome: str
+    """``"cut"`` (the edges met with wood between them), ``"missed"`` (without wood), ``"stalled"`` (the wood takes more
+    force than the blade has) or ``"blocked"`` (a wire, a post, old wood or wood thicker than the mouth is between the
+    edges)."""
+    sentence: str
+    """What happened, for users."""
+    force: float
+    """[N] Largest force that the edges exerted on the wood."""
+    needed: float
+    """[N] Largest force that cutting all wood in the mouth takes."""
+    energy: float
+    """[J] Energy that went into the wood."""
+    body: int
+    """Index of the thickest body between the edges, -1 for none."""
+    at: float
+    """[m] Place of the cut along this body."""
+    diameter: float
+    """[m] Diameter of this body there."""
+    depth: float
+    """[m] Depth of the cut in this body, the cuts of earlier closings included."""
+    position: np.ndarray
+    """[3] m, the place of the cut in the world; the middle of the mouth if there is no wood."""
