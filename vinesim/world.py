@@ -16,6 +16,7 @@ from vinesim.core import frames
 from vinesim.interaction.blades import Blade
 from vinesim.interaction.detachment import DetachmentMonitor
 from vinesim.interaction.dormant_bunches import DormantBunches
+from vinesim.interaction.fruit_damage import FruitMonitor
 from vinesim.interaction.hand_grasp import GraspManager
 from vinesim.interaction.stalk import is_on_stalk
 from vinesim.interaction.support_tracking import SupportTracker
@@ -83,6 +84,7 @@ class Physics:
         self.contact_solver = ContactSolver(model, self.plants, self.rigid, wires)
         self.detachment_monitor = DetachmentMonitor(self.plants, self.rigid, self.contact_solver, p)
         self.grasp_manager = GraspManager(self.plants, self.rigid, self.contact_solver)
+        self.fruit_monitor = FruitMonitor(self.plants, self.rigid, self.contact_solver)
         self.support_tracker = SupportTracker(self.rigid)
         self.dormant_bunches = DormantBunches(self.plants, self.rigid, self.contact_solver, self.support_tracker)
         self.level_of_detail = LevelOfDetail(self.plants, p)
@@ -125,6 +127,7 @@ class Physics:
             ("contacts: wake trees that others touch, solve all together", self.contact_solver.solve),
             ("plants: integrate with contact wrenches", self._integrate_plants),
             ("rigid: integrate with contact forces", self._integrate_rigid),
+            ("fruit: record what happens to bunches", self._record_fruit),
             ("wires: follow what presses on them", self._deflect_wires),
             ("faults: stop trees with invalid rates", self.fault_guard.stop_faulty_trees),
             ("detachment: detach what broke or was cut", self._detach),
@@ -184,6 +187,9 @@ class Physics:
         if held is not None:
             force = held if force is None else force + held
         self.rigid.integrate(force)
+
+    def _record_fruit(self) -> None:
+        self.fruit_monitor.update(self.grasp_manager.contacts)
 
     def _deflect_wires(self) -> None:
         self.contact_solver.report_wires()

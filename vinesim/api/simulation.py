@@ -39,7 +39,15 @@ from vinesim.scene.spec import Scene, load_scene
 from vinesim.scene.state import State
 from vinesim.scene.surroundings import Box, main_axis
 from vinesim.scene.terrain import Terrain, on_ground
-from vinesim.scene.values import BladeClosing, Contact, Detachment, RigidBox, Snapshot
+from vinesim.scene.values import (
+    BladeClosing,
+    BunchHistory,
+    Contact,
+    Detachment,
+    FruitEvent,
+    RigidBox,
+    Snapshot,
+)
 from vinesim.scene.wind import Wind, wind_of
 from vinesim.wind.sway import Sway
 from vinesim.world import Physics
@@ -121,6 +129,7 @@ class Simulation:
         self._pushed: set[tuple[str, str]] = set()
         self._detachments: list[Detachment] = []
         self._closings: list[BladeClosing] = []
+        self._fruit_events: list[FruitEvent] = []
         self._primitives: Primitives | None = None
         self._sway = Sway(model)
         self._fault_log = FaultLog(_warn_caller_of_step)
@@ -139,6 +148,7 @@ class Simulation:
         self._check_joints(self.physics.plants.awake)
         self._detachments = []
         self._closings = []
+        self._fruit_events = []
         for name in self.robots.keys() - set(self.physics.rigid.robots):  # robots that are no longer in the physics
             self._forget_robot(name)
         for _ in range(count):
@@ -149,6 +159,7 @@ class Simulation:
             self.physics.step()
             self._detachments += self.physics.detachments
             self._closings += self.physics.closings
+            self._fruit_events += self.physics.fruit_monitor.events
         for body, before in self._loads.items():
             self.physics.plants.body_load[body] = before
         if self._loads:  # a tree that fell asleep under its load must move again
@@ -206,6 +217,16 @@ class Simulation:
         """Closings of blades that ended in the last call of :meth:`step`: force, energy, depth, and why a blade did not
         close."""
         return tuple(self._closings)
+
+    @property
+    def fruit_events(self) -> tuple[FruitEvent, ...]:
+        """Falls of bunches, and berries that burst or fell off, in the last call of :meth:`step`."""
+        return tuple(self._fruit_events)
+
+    def bunch_history(self, bunch: int) -> BunchHistory:
+        """Returns what has happened to a bunch since the start: forces, pressure, drops, time in hands, berries burst
+        and lost. ``bunch``: index in the model."""
+        return self.physics.fruit_monitor.history(checked_index("bunch", bunch, len(self.model.bunch_body), UsageError))
 
     @property
     def faults(self) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""Events of the vineyard as rows for JSON: what left its plant, and how blades closed.
+"""Events of the vineyard as rows for JSON: what left its plant, how blades closed, and what happened to the fruit.
 
 Rows come from the client that simulated the event. Other clients learn of its result by the network.
 """
@@ -7,13 +7,49 @@ from __future__ import annotations
 
 from typing import Any
 
-from vinesim.scene.values import BladeClosing, Detachment
+from vinesim.scene.values import BladeClosing, BunchHistory, Detachment, FruitEvent
 from vinesim.world import Physics
 
 
 def events_of(physics: Physics) -> list[dict[str, Any]]:
-    """Returns the events of the last step: closings of blades first, then detachments."""
-    return [*map(_closing, physics.closings), *map(_detachment, physics.detachments)]
+    """Returns the events of the last step: closings of blades first, then detachments, then those of fruit."""
+    fruit = [_fruit(physics, event) for event in physics.fruit_monitor.events]
+    return [*map(_closing, physics.closings), *map(_detachment, physics.detachments), *fruit]
+
+
+def fruit_report(physics: Physics) -> dict[str, Any]:
+    """Returns what happened to the bunches that actors touched or that fell, as far as this client simulated it: each
+    bunch, and totals."""
+    found = [physics.fruit_monitor.history(bunch) for bunch in physics.fruit_monitor.handled()]
+    return {
+        "bunches": [history_row(one) for one in found],
+        "berries": sum(one.berries for one in found),
+        "berries_burst": sum(one.berries_burst for one in found),
+        "berries_lost": sum(one.berries_lost for one in found),
+    }
+
+
+def history_row(history: BunchHistory) -> dict[str, Any]:
+    """Returns what has happened to a bunch, for JSON."""
+    return {
+        "bunch": history.bunch,
+        "berries": history.berries,
+        "hand_s": history.hand_time,
+        "impulse_ns": history.impulse,
+        "peak_force_n": history.peak_force,
+        "peak_pressure_pa": history.peak_pressure,
+        "drops": history.drops,
+        "drop_height_m": history.drop_height,
+        "acceleration_mps2": history.acceleration,
+        "berries_burst": history.berries_burst,
+        "berries_lost": history.berries_lost,
+        "damage": history.damage,
+    }
+
+
+def _fruit(physics: Physics, event: FruitEvent) -> dict[str, Any]:
+    row = {"event": "fruit", "what": event.what, **history_row(physics.fruit_monitor.history(event.bunch))}
+    return row | ({"height_m": event.value} if event.what == "dropped" else {})
 
 
 def _closing(event: BladeClosing) -> dict[str, Any]:

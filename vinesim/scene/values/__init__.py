@@ -52,7 +52,16 @@ from vinesim.scene.values.sensors import (
 )
 from vinesim.scene.values.signals import INTENTIONS, TONE_LEVEL, HandGestures, Intention, LightPattern, Lights
 from vinesim.scene.values.status import ComponentStatus
-from vinesim.scene.values.world import BladeClosing, Contact, Detachment, SegmentPoses, Snapshot, WindState
+from vinesim.scene.values.world import (
+    BladeClosing,
+    BunchHistory,
+    Contact,
+    Detachment,
+    FruitEvent,
+    SegmentPoses,
+    Snapshot,
+    WindState,
+)
 
 __all__ = [
     "FORWARD_KINDS",
@@ -64,6 +73,7 @@ __all__ = [
     "Band",
     "BladeClosing",
     "Box",
+    "BunchHistory",
     "BunchTruth",
     "CameraFrame",
     "CameraInfo",
@@ -77,6 +87,7 @@ __all__ = [
     "Drive",
     "ElasticSample",
     "FixKind",
+    "FruitEvent",
     "GnssFix",
     "GnssMount",
     "GripperState",
