@@ -10,6 +10,7 @@ Positions are in m, forces in N, in world axes (:mod:`vinesim.core.frames`).
 from __future__ import annotations
 
 import functools
+import numbers
 import pathlib
 import warnings
 from collections.abc import Iterable, Sequence
@@ -458,7 +459,7 @@ class Simulation:
         if not (edges > 0.0).all():
             raise UsageError(f"size is {size}; give three edges above 0 [m]")
         for name, value, unit in (("force", force, "N"), ("speed", speed, "m/s")):
-            if not (isinstance(value, (int, float)) and value > 0.0):
+            if isinstance(value, bool) or not (isinstance(value, numbers.Real) and value > 0.0):
                 raise UsageError(f"{name} is {value!r}; give more than 0 {unit}")
         if kind not in BLADE_FACTORS:
             raise UsageError(f"kind is {kind!r}; give {', '.join(BLADE_FACTORS)}")
