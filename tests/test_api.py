@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import vinesim
+from tests.support.contact_scenes import bunch_scene
 from tests.support.waiting import deadline
 from vinesim.core import frames
 from vinesim.core.errors import UsageError
@@ -720,6 +721,35 @@ def test_a_blade_on_a_pusher_cuts_the_cane_in_its_mouth():
     assert (cut.cause, cut.actor) == ("blade", pusher.name)
 
 
+def blade_of(simulation: vinesim.Simulation, **fields) -> vinesim.Blade:
+    """A blade on a new pusher, around the middle of a cane of the default builder."""
+    pusher = simulation.add_pusher(position=(0.5, -0.06, 1.0))
+    return simulation.add_blade(pusher.name, "body", (0, 0.06, 0, 0, 0, 0, 1), size=(0.02, 0.04, 0.04), **fields)
+
+
+def test_a_blade_with_too_little_force_stalls_and_says_so():
+    simulation = vinesim.Simulation(vinesim.CaneBuilder(damping_ratio=0.1, shape="equilibrium"))
+    blade_of(simulation, force=50.0, speed=0.4).close()
+    simulation.step(12)
+    (closing,) = simulation.closings
+    assert (closing.outcome, closing.force) == ("stalled", pytest.approx(50.0))
+    assert 0.0 < closing.depth < closing.diameter
+    assert simulation.detachments == ()
+    simulation.step()
+    assert simulation.closings == ()
+
+
+def test_a_bunch_that_is_picked_falls_and_has_a_history():
+    model, _, _ = bunch_scene()
+    simulation = vinesim.Simulation(model)
+    simulation.pick(0)
+    simulation.step(120)
+    (fall,) = [event for event in simulation.fruit_events if event.what == "dropped"]
+    history = simulation.bunch_history(0)
+    assert history.drop_height == fall.value > 1.5
+    assert 0.0 < history.damage < 1.0
+
+
 def test_a_wind_that_is_set_bends_a_cane_and_ends():
     model = vinesim.cane(damping_ratio=0.3, shape="equilibrium")
     model.body_drag[:] = 0.01
@@ -760,6 +790,11 @@ BUILDERS = [
     (lambda s: s.add_box((0, 0, 0)), "box is a tuple; give vinesim.Box"),
     (lambda s: s.remove_box(True), "no box True; there are: none"),
     (lambda s: s.add_blade("bob", "body", size=(1, 1, 1)), "no robot or pusher 'bob'; there are: none"),
+    (lambda s: blade_of(s, force=0.0), "force is 0.0; give more than 0 N"),
+    (lambda s: blade_of(s, speed=True), "speed is True; give more than 0 m/s"),
+    (lambda s: blade_of(s, kind="axe"), "kind is 'axe'; give bypass, anvil, saw"),
+    (lambda s: blade_of(s).close(NAN), "a blade closes with nan N; give more than 0"),
+    (lambda s: s.bunch_history(3), "bunch 3 does not exist"),
     (lambda s: setattr(s, "wind", 3.0), "wind is a float; give vinesim.Wind, or None"),
     (lambda _: vinesim.Wind((NAN, 0, 0)), "mean wind .*: give three finite numbers"),
     (lambda _: vinesim.Wind((1, 0, 0), gusts=-1.0), "gusts -1.0 m/s"),

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from vinesim.api.sweep import sweep as sweep
     from vinesim.core import frames as frames
     from vinesim.core.errors import UsageError as UsageError
-    from vinesim.interaction.detachment import Blade as Blade
+    from vinesim.interaction.blades import Blade as Blade
     from vinesim.net.server.server import Server as Server
     from vinesim.plants.rollout import Rollout as Rollout
     from vinesim.robot.drives.controlled_robot import Robot as Robot
@@ -61,7 +61,7 @@ if TYPE_CHECKING:
     from vinesim.scene.wind import Wind as Wind
 
 _MODULES = {
-    "Blade": "interaction.detachment",
+    "Blade": "interaction.blades",
     "Box": "scene.surroundings",
     "Camera": "api.sensors",
     "CaneBuilder": "scene.cane",

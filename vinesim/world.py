@@ -13,8 +13,10 @@ import numpy as np
 
 from vinesim.contact.contact_solver import ContactSolver
 from vinesim.core import frames
-from vinesim.interaction.detachment import Blade, DetachmentMonitor
+from vinesim.interaction.blades import Blade
+from vinesim.interaction.detachment import DetachmentMonitor
 from vinesim.interaction.dormant_bunches import DormantBunches
+from vinesim.interaction.fruit_damage import FruitMonitor
 from vinesim.interaction.hand_grasp import GraspManager
 from vinesim.interaction.stalk import is_on_stalk
 from vinesim.interaction.support_tracking import SupportTracker
@@ -28,6 +30,7 @@ from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
 from vinesim.scene.values import (
+    BladeClosing,
     Contact,
     Detachment,
     GivenWood,
@@ -82,6 +85,7 @@ class Physics:
         self.contact_solver = ContactSolver(model, self.plants, self.rigid, wires)
         self.detachment_monitor = DetachmentMonitor(self.plants, self.rigid, self.contact_solver, p)
         self.grasp_manager = GraspManager(self.plants, self.rigid, self.contact_solver)
+        self.fruit_monitor = FruitMonitor(self.plants, self.rigid, self.contact_solver)
         self.support_tracker = SupportTracker(self.rigid)
         self.dormant_bunches = DormantBunches(self.plants, self.rigid, self.contact_solver, self.support_tracker)
         self.level_of_detail = LevelOfDetail(self.plants, p)
@@ -115,6 +119,7 @@ class Physics:
         return (
             ("wind: set the air velocity at trees near actors", self._set_wind),
             ("grasps: close and open hands, pull held plants", self.grasp_manager.begin_step),
+            ("blades: hold the wood between closing edges", self._hold_wood),
             ("rigid: predict velocities without plant contacts", self.rigid.predict),
             ("contacts: wake trees near moving geoms", self.contact_solver.wake_near_trees),
             ("detail: refine bunches near actors", self._refine_bunches),
@@ -123,6 +128,7 @@ class Physics:
             ("contacts: wake trees that others touch, solve all together", self.contact_solver.solve),
             ("plants: integrate with contact wrenches", self._integrate_plants),
             ("rigid: integrate with contact forces", self._integrate_rigid),
+            ("fruit: record what happens to bunches", self._record_fruit),
             ("wires: follow what presses on them", self._deflect_wires),
             ("faults: stop trees with invalid rates", self.fault_guard.stop_faulty_trees),
             ("detachment: detach what broke or was cut", self._detach),
@@ -174,8 +180,18 @@ class Physics:
             self._body_q = None
             self._kinematics_current = False
 
+    def _hold_wood(self) -> None:
+        self.detachment_monitor.grips.begin_step(self.detachment_monitor.blades)
+
     def _integrate_rigid(self) -> None:
-        self.rigid.integrate(self.contact_solver.rigid_force)
+        force = self.contact_solver.rigid_force
+        held = self.detachment_monitor.grips.react()
+        if held is not None:
+            force = held if force is None else force + held
+        self.rigid.integrate(force)
+
+    def _record_fruit(self) -> None:
+        self.fruit_monitor.update(self.grasp_manager.contacts)
 
     def _deflect_wires(self) -> None:
         self.contact_solver.report_wires()
@@ -210,17 +226,23 @@ class Physics:
         return self.tick * self.dt
 
     @property
+    def closings(self) -> tuple[BladeClosing, ...]:
+        """Closings of blades that ended in the last step."""
+        return self.detachment_monitor.closings
+
+    @property
     def contacts(self) -> tuple[Contact, ...]:
         """Contacts with plants in the last step, sorted by (tree, body, shape, geom), followed by one contact for each
-        hand that held a plant."""
-        return self.contact_solver.contacts + self.grasp_manager.contacts
+        hand that held a plant, and for each piece of wood that a closing blade held."""
+        return self.contact_solver.contacts + self.grasp_manager.contacts + self.detachment_monitor.grips.contacts
 
     @property
     def touched(self) -> tuple[tuple[int, str], ...]:
         """Pairs (tree, actor) for each tree that the actor pressed or held in the last step, sorted."""
-        if not self.grasp_manager.contacts:
+        contacts = self.grasp_manager.contacts + self.detachment_monitor.grips.contacts
+        if not contacts:
             return self.contact_solver.touched_trees
-        held = ((int(self.model.body_tree[contact.body]), contact.actor) for contact in self.grasp_manager.contacts)
+        held = ((int(self.model.body_tree[contact.body]), contact.actor) for contact in contacts)
         return tuple(sorted({*self.contact_solver.touched_trees, *held}))
 
     def update_kinematics(self) -> None:
@@ -401,17 +423,32 @@ class Physics:
         """Refine the bunches within ``radius`` [m] of ``points`` [k, 3]; see :meth:`LevelOfDetail.set_focus`."""
         self.level_of_detail.set_focus(points, radius)
 
-    def add_blade(self, actor: str, link: str, pose: np.ndarray, half: np.ndarray) -> Blade:
+    def add_blade(
+        self,
+        actor: str,
+        link: str,
+        pose: np.ndarray,
+        half: np.ndarray,
+        *,
+        force: float = np.inf,
+        speed: float = np.inf,
+        kind: str = "bypass",
+    ) -> Blade:
         """Attach a cutter to a link of an actor. Its mouth is a box: ``pose`` [7] in the link's frame, half edges
         ``half`` [3] m.
 
         The box's x axis runs along the two blades, its y axis from one blade to the other. :meth:`Blade.close` cuts the
-        wood that passes through the mouth.
+        wood that passes through the mouth. ``force`` [N]: largest closing force. ``speed`` [m/s]: speed with which the
+        edges approach each other. ``kind``: see :data:`~vinesim.interaction.cutting_force.BLADE_FACTORS`.
         """
         self.rigid.link_pose(actor, link)  # raises an error if there is no such link
-        blade = Blade(actor, link, np.asarray(pose, float), np.asarray(half, float))
+        blade = Blade(actor, link, np.asarray(pose, float), np.asarray(half, float), force, speed, kind)
         self.detachment_monitor.blades.append(blade)
         return blade
 
     def _remove_blades_of(self, actor: str) -> None:
-        self.detachment_monitor.blades = [blade for blade in self.detachment_monitor.blades if blade.actor != actor]
+        monitor = self.detachment_monitor
+        for blade in monitor.blades:
+            if blade.actor == actor:
+                monitor.grips.release_all(blade)
+        monitor.blades = [blade for blade in monitor.blades if blade.actor != actor]

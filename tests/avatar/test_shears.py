@@ -8,12 +8,15 @@ import pytest
 from tests.support.contact_scenes import bunch_scene, cane
 from vinesim.avatar.local_human import CUT_PULSE, MISS_PULSE, LocalHuman
 from vinesim.core import frames
+from vinesim.interaction.cutting_force import remaining_strength
 from vinesim.rigid.human_posture import standing_pose
 from vinesim.scene import appearance
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import HumanSpec
 from vinesim.world import Physics
 
+CLOSING = 18
+"""Steps in which the shears close wholly: 32 mm with 0.2 m/s."""
 AHEAD = frames.from_yaw(0.5 * np.pi)
 """The person looks along y."""
 
@@ -34,9 +37,11 @@ class Person:
         """Do some steps with the hand in another state; how the shears closed meanwhile."""
         self.pose = dataclasses.replace(self.pose, **hand)
         found = []
+        self.detachments = []
         for _ in range(steps):
             self.human.control(self.physics.time)
             self.physics.step()
+            self.detachments += self.physics.detachments
             self.human.update(self.physics.time)
             found += self.human.closures
         return found
@@ -54,25 +59,26 @@ def test_shears_cut_the_peduncle_between_their_blades_when_the_hand_closes():
     physics, body, eva = at_peduncle()
     assert eva.run(10) == []
     assert physics.state.bunch_attached.all(), "open shears cut nothing"
-    eva.run(1, right_closed=True)
-    (detachment,) = physics.detachments
+    assert eva.run(10, right_closed=True) == []
+    assert physics.state.bunch_attached.all(), "the blades need 16 steps"
+    (closure,) = eva.run(CLOSING)
+    (detachment,) = eva.detachments
     assert (detachment.bunch, detachment.body, detachment.cause, detachment.actor) == (0, body, "blade", "eva")
-    (closure,) = eva.human.closures
     assert (closure.side, closure.bunches, closure.canes) == ("right", 1, 0)
     assert closure.sentence == "The shears in the right hand cut 1 bunch."
-    assert ("right", *CUT_PULSE) in [(one.hand, one.amplitude, one.duration) for one in eva.human.haptics]
+    assert closure.haptic("eva").amplitude == CUT_PULSE[0]
     assert eva.run(20) == [], "a hand that stays closed has closed once"
     assert physics.hand("eva", "right").held is None, "a hand with shears holds nothing"
 
 
 def test_shears_beside_the_wood_miss_and_may_close_again():
     physics, _, eva = at_peduncle(aside=0.05)
-    (closure,) = eva.run(5, right_closed=True)
+    (closure,) = eva.run(CLOSING, right_closed=True)
     assert (closure.has_cut, closure.resistance) == (False, 0.0)
     assert "missed" in closure.sentence
     assert closure.haptic("eva").amplitude == MISS_PULSE[0]
     assert eva.run(5, right_closed=False) == []
-    assert len(eva.run(5, right_closed=True)) == 1
+    assert len(eva.run(CLOSING, right_closed=True)) == 1
     assert physics.state.bunch_attached.all()
 
 
@@ -85,7 +91,7 @@ def test_two_hands_that_close_in_one_step_report_each_its_own_cut(bunches):
     stalks[:, 0] += [0.0 if cuts else 0.05 for cuts in bunches]
     eva = Person(physics, stalks[1], stalks[0], left_shears=True, right_shears=True)
     assert eva.run(5) == []
-    closures = eva.run(1, left_closed=True, right_closed=True)
+    closures = eva.run(CLOSING, left_closed=True, right_closed=True)
     assert [(one.side, one.bunches, one.canes) for one in closures] == [
         ("left", bunches[0], 0),
         ("right", bunches[1], 0),
@@ -96,7 +102,7 @@ def test_two_hands_that_close_in_one_step_report_each_its_own_cut(bunches):
 def test_shears_that_close_on_a_peduncle_without_its_bunch_say_so():
     physics, _, eva = at_peduncle()
     physics.pick(0)
-    (closure,) = eva.run(1, right_closed=True)
+    (closure,) = eva.run(CLOSING, right_closed=True)
     assert not closure.has_cut
     assert 0.0 < closure.resistance < closure.force
     assert "was picked before" in closure.sentence
@@ -115,12 +121,26 @@ def test_wood_that_resists_more_than_the_shears_can_do_stays_and_the_person_is_t
     physics = Physics(assemble([cane((0.0, 0.0, 1.3), radius=radius)]))
     at = physics.snapshot().body_q[8].astype(float)
     eva = Person(physics, at[:3] + frames.rotate(at[3:], np.array([0.03, 0.0, 0.0])), right_shears=True)
-    (closure,) = eva.run(2, right_closed=True)
+    (closure,) = eva.run(CLOSING, right_closed=True)
     expected = physics.parameters.cutting_strength * np.pi * radius**2
     assert closure.resistance == pytest.approx(expected, rel=1e-3)
     assert (closure.bunches, closure.canes) == (0, int(is_cut))
     assert physics.state.body_cut.any() == is_cut
     assert is_cut or f"too weak: this wood takes {expected:,.0f} N" in closure.sentence
+
+
+def test_shears_in_a_hand_that_opens_early_leave_a_partial_cut_that_weakens_the_peduncle():
+    physics, body, eva = at_peduncle()
+    assert eva.run(15, right_closed=True) == [], "30 of 32 mm: 2 mm deep in a peduncle of 4 mm"
+    assert eva.run(5, right_closed=False) == []
+    ((segment, (_, depth)),) = physics.detachment_monitor.notches.items()
+    assert segment == body - 1
+    assert depth == pytest.approx(0.5, abs=0.01)
+    monitor = physics.detachment_monitor
+    pull, bend = remaining_strength(depth)
+    assert monitor._pull[0] == pytest.approx(pull * physics.model.bunch_pull[0])
+    assert monitor._bend[0] == pytest.approx(bend * physics.model.bunch_bend[0])
+    assert physics.plants.held_bodies == []
 
 
 def test_the_blades_go_with_the_person():
@@ -136,7 +156,7 @@ def test_what_is_between_the_blades_is_known_before_they_close():
     physics, _, eva = at_peduncle()
     eva.run(1)
     assert eva.human.between_blades() == ("", "bunch")
-    eva.run(1, right_closed=True)
+    eva.run(CLOSING, right_closed=True)
     assert eva.human.between_blades() == ("", ""), "a stalk without its bunch"
     eva.run(1, right_closed=False, right_shears=False)
     assert eva.human.between_blades() == ("", ""), "no shears"

@@ -261,6 +261,11 @@ def test_a_bunch_that_a_person_cuts_with_shears_is_cut_on_all_clients():
     world.run(0.2)
     for client in (eva, ida):
         assert not parts & {one.name for one in client.physics.snapshot().visuals}
+    world.run(1.0)
+    falls = [client.physics.fruit_monitor.history(0) for client in (eva, ida)]
+    assert [one.drops for one in falls] == [1, 0], "only the client that simulates the fall records it"
+    assert falls[0].drop_height == pytest.approx(stalk[2], abs=0.3)
+    assert falls[1].damage == 0.0
 
 
 def test_a_teleported_human_is_placed_at_once():

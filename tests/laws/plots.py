@@ -17,10 +17,13 @@ import numpy as np
 import warp as wp
 
 from tests.laws import test_integration, test_rod_in_space
+from tests.physics import test_cutting
 from tests.support import beam_theory
 from tests.support.contact_forces import force_on
 from tests.support.contact_scenes import bunch_scene, grasp, gripper, held_point
 from vinesim.bench.mujoco_reference import MujocoScene
+from vinesim.interaction import cutting_force
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.world import Physics
 
 matplotlib.use("Agg")
@@ -257,6 +260,83 @@ def machine() -> str:
     )
 
 
+PUBLISHED_CUTS = (
+    # name, strength [Pa], diameter [m], force [N], energy [J], share of the energy; whether force gives the diameter
+    ("Tannat, dormant", 13.94e6, 9.2e-3, 981.65, 2.39, cutting_force.DORMANT_ENERGY_SHARE, False),
+    ("Cabernet Franc, dormant", 21.68e6, 9.2e-3, 1397.60, 3.68, cutting_force.DORMANT_ENERGY_SHARE, False),
+    ("Okuzgozu, veraison, mean", 13.16e6, 8.665e-3, 774.55, 5.94, cutting_force.CHORD_ENERGY_SHARE, True),
+    ("Okuzgozu, harvest, mean", 9.63e6, 8.665e-3, 568.42, 3.33, cutting_force.CHORD_ENERGY_SHARE, True),
+    ("Okuzgozu, internode 1", 13.16e6, 6.107e-3, 385.52, 1.85, cutting_force.CHORD_ENERGY_SHARE, True),
+    ("Okuzgozu, internode 5", 13.16e6, 9.814e-3, 995.49, 7.34, cutting_force.CHORD_ENERGY_SHARE, True),
+    ("Bogazkere, flat blade", 9.34e6, 6.0e-3, 263.50, None, cutting_force.CHORD_ENERGY_SHARE, True),
+    ("Bogazkere, serrated blade", 15.59e6, 6.0e-3, 440.50, None, cutting_force.CHORD_ENERGY_SHARE, True),
+)
+
+
+def cut(diameter: float, strength: float, share: float) -> tuple[float, float]:
+    """Largest force [N] and energy [J] of a blade that cuts a cane in the simulation."""
+    parameters = PhysicsParameters(cutting_strength=strength, cutting_energy_share=share)
+    physics, blade, _ = test_cutting.on_cane(radius=0.5 * diameter, speed=0.1, parameters=parameters)
+    (event,) = test_cutting.close(physics, blade)
+    assert event.outcome == "cut"
+    return event.force, event.energy
+
+
+def cutting() -> Table:
+    """Blades in the simulation against published cutting forces and energies."""
+    figure, (by_diameter, by_depth) = plt.subplots(1, 2, figsize=(11, 4.4), layout="constrained")
+    diameters = np.linspace(4e-3, 11e-3, 60)
+    woods = {13.94e6: WOOD, 21.68e6: INK, 13.16e6: LEAF, 9.63e6: GRAPE, 9.34e6: GREY, 15.59e6: "#2a6f97"}
+    for strength, colour in woods.items():
+        force = [cutting_force.shear_force(d, strength) for d in diameters]
+        by_diameter.plot(1e3 * diameters, force, color=colour, lw=1)
+    rows = []
+    for name, strength, diameter, force, energy, share, is_implied in PUBLISHED_CUTS:
+        found, work = cut(diameter, strength, share)
+        by_diameter.plot(1e3 * diameter, force, "s" if not is_implied else "d", color=woods[strength], ms=6, label=name)
+        by_diameter.plot(1e3 * diameter, found, "x", color=woods[strength], ms=6)
+        rows.append(
+            (
+                name,
+                f"{1e-6 * strength:.2f}",
+                f"{1e3 * diameter:.2f}" + (" (implied)" if is_implied else ""),
+                f"{force:,.0f}",
+                f"{found:,.0f} ({100 * (found / force - 1):+.1f} %)",
+                "" if energy is None else f"{energy:.2f}",
+                "" if energy is None else f"{work:.2f} ({100 * (work / energy - 1):+.0f} %)",
+            )
+        )
+    by_diameter.set(xlabel="diameter [mm]", ylabel="largest force [N]", ylim=(0, None))
+    by_diameter.set_title("published (diamonds: diameter implied by force), blades (crosses)")
+    by_diameter.legend(fontsize=7.5, loc="upper left")
+
+    for share, colour, name in (
+        (cutting_force.CHORD_ENERGY_SHARE, LEAF, "cane with leaves"),
+        (cutting_force.DORMANT_ENERGY_SHARE, WOOD, "dormant cane"),
+    ):
+        parameters = PhysicsParameters(cutting_energy_share=share)
+        physics, blade, _ = test_cutting.on_cane(radius=0.005, speed=0.02, parameters=parameters)
+        blade.close()
+        seen = []
+        while blade.closing:
+            before, depth = blade.energy, 0.01 - blade.gap
+            physics.step()
+            seen.append((0.5 * (depth + 0.01 - blade.gap), (blade.energy - before) / 2e-4))
+        mid, force = np.array([row for row in seen if 0.0 < row[0] < 0.01]).T
+        by_depth.plot(1e3 * mid, force, "o", ms=3, color=colour, label=f"{name}: work by way of a blade")
+        line = np.linspace(0.0, 1.0, 200)
+        law = cutting_force.shear_force(0.01) * cutting_force.force_share(line, share)
+        by_depth.plot(10 * line, law, color=colour, lw=1)
+    by_depth.set(xlabel="depth of the edges in 10 mm [mm]", ylabel="force [N]", ylim=(None, 1300))
+    by_depth.set_title("force over depth: law (lines) and blades (dots)")
+    by_depth.legend(fontsize=8, loc="upper center")
+    save(figure, "cutting")
+    return table(
+        ("wood", "strength [MPa]", "diameter [mm]", "published force [N]", "blade", "published energy [J]", "blade"),
+        rows,
+    )
+
+
 def _lines(path: str) -> list[str]:
     file = pathlib.Path(path)
     return file.read_text().splitlines() if file.exists() else []
@@ -272,6 +352,7 @@ def main() -> None:
         ("damping", damping, "damping ratio asked against seen"),
         ("energy", energy, "energy over a minute"),
         ("grasp", grasped, "a grasp against the same scene in MuJoCo"),
+        ("cutting", cutting, "cutting forces of blades and of papers"),
     )
     for name, draw, text in sections:
         print(name, flush=True)

@@ -283,6 +283,7 @@ def test_a_step_is_a_list_of_stages_and_trees_fall_asleep():
     assert [name.split(":")[0] for name, _ in physics.stages] == [
         "wind",
         "grasps",
+        "blades",
         "rigid",
         "contacts",
         "detail",
@@ -291,6 +292,7 @@ def test_a_step_is_a_list_of_stages_and_trees_fall_asleep():
         "contacts",
         "plants",
         "rigid",
+        "fruit",
         "wires",
         "faults",
         "detachment",

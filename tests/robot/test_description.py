@@ -394,6 +394,18 @@ def test_quality_size_and_rate_of_a_camera_come_from_the_sidecar(tmp_path: pathl
             "[groups.arm]\njoints = ['shoulder_joint']\n[[cutters]]\ngroup = 'arm'\nframe = 'arm'\nhalf = [1, 0, 1]",
             "the half edges",
         ),
+        *(
+            (
+                "[groups.arm]\njoints = ['shoulder_joint']\n[[cutters]]\ngroup = 'arm'\nframe = 'arm'\n"
+                f"half = [1, 1, 1]\n{key}",
+                words,
+            )
+            for key, words in (
+                ("force = 0.0", "has 0.0 N; give more than 0"),
+                ("speed = 0.0", "closes with 0.0 m/s; give more than 0"),
+                ("blade = 'axe'", "axe"),
+            )
+        ),
         ("[base", "Expected"),
     ],
 )

@@ -150,6 +150,15 @@ def test_a_trajectory_moves_a_joint_and_a_velocity_the_base(client, monkeypatch,
         peer.node.create_subscription(String, "/human_intention", heard.append, latched)
         peer.node.create_subscription(String, "/human_gesture", shown.append, latched)
         wait_until(lambda: heard and shown, step, "the latched intention and gesture")
+        events: list[String] = []
+        peer.node.create_subscription(String, "/vine/events", events.append, 10)
+        wait_until(lambda: node.has_subscribers("vine/events"), step, "a listener of events")
+        node.publish_events(3.5, [{"event": "blade", "outcome": "stalled"}, {"event": "detached", "bunch": 4}])
+        wait_until(lambda: len(events) == 2, step, "both events")
+        assert [json.loads(event.data) for event in events] == [
+            {"time": 3.5, "event": "blade", "outcome": "stalled"},
+            {"time": 3.5, "event": "detached", "bunch": 4},
+        ]
         assert json.loads(shown[0].data) == {
             "time": 2.5,
             "people": [{"person": "anna", "left": "open_hand", "right": "point"}],

@@ -203,6 +203,7 @@ def test_every_topic_is_heard_with_its_official_type():
             sensors.publish(camera_frame(t, 32, 24))
             sensors.publish(lidar_scan(t, 10))
             robot.publish_environment(t, names, poses)
+            robot.publish_events(t, [{"event": "blade", "outcome": "missed"}])
             robot.publish_diagnostics(t, [ComponentStatus("simulation")])
 
         def sent() -> dict[str, int]:
@@ -241,6 +242,7 @@ def test_ten_seconds_of_every_step_wait_for_a_subscriber_and_five_pictures_or_cl
         "tf",
         "mobile_base_controller/odom",
         "vine/contacts",
+        "vine/events",
         "base_imu",
         "wrist/wrench",
         "see/k/state",
@@ -282,6 +284,7 @@ TYPES = {
     "/tf_environment_static": "tf2_msgs/msg/TFMessage",
     "/mobile_base_controller/odom": "nav_msgs/msg/Odometry",
     "/vine/contacts": "sensor_msgs/msg/PointCloud2",
+    "/vine/events": "std_msgs/msg/String",
     "/vine/markers": "visualization_msgs/msg/MarkerArray",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
     "/lidar/points": "sensor_msgs/msg/PointCloud2",

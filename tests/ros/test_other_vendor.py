@@ -350,6 +350,7 @@ TABLE: dict[str, tuple[str, Callable[[dict[str, Any]], None]]] = {
         "sensor_msgs/msg/PointCloud2",
         cloud(frame="map", fields="x y z force_x force_y force_z body bunch link", least=0),
     ),
+    "/vine/events": ("std_msgs/msg/String", check_no_markers),
     "/vine/markers": ("visualization_msgs/msg/MarkerArray", check_no_markers),
     "/base_imu": ("sensor_msgs/msg/Imu", check_imu),
     **{
@@ -415,7 +416,14 @@ LATCHED = {
     "/indicator_lights/markers",
     f"{CAMERA}/label_info",
 }
-ROWS = [(topic, qos) for topic in TABLE for qos in (("latched",) if topic in LATCHED else ("default", "sensor"))]
+SILENT = {"/vine/events"}
+"""Topics on which nothing is sent here, because nothing happens to the plants."""
+ROWS = [
+    (topic, qos)
+    for topic in TABLE
+    if topic not in SILENT
+    for qos in (("latched",) if topic in LATCHED else ("default", "sensor"))
+]
 
 
 @pytest.fixture(scope="module")

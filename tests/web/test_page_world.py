@@ -297,7 +297,7 @@ def test_a_page_is_told_of_the_shears_in_its_persons_hand_and_of_what_they_cut(a
         hand = TrackedHand(palm, closed)
         other = TrackedHand((-1.5, 0.2, *palm[2:]), closed) if left else None
         world.take(0, PageInput(1, head, TrackedPerson(head, other, hand, shears=(left, shears))))
-        for _ in range(5):
+        for _ in range(17):  # the blades need 16 steps
             client.tick()
         told, arrays = decode(world.state(-1)[1])
         names = decode(world.rigid())[0]["names"]

@@ -10,6 +10,7 @@ Positions are in m, forces in N, in world axes (:mod:`vinesim.core.frames`).
 from __future__ import annotations
 
 import functools
+import numbers
 import pathlib
 import warnings
 from collections.abc import Iterable, Sequence
@@ -24,7 +25,8 @@ from vinesim.client.faults import FaultLog, occurred
 from vinesim.core import frames, progress
 from vinesim.core.errors import UsageError, checked_index
 from vinesim.core.numbers import as_numbers, checked_vector, is_number, is_whole
-from vinesim.interaction.detachment import Blade
+from vinesim.interaction.blades import Blade
+from vinesim.interaction.cutting_force import BLADE_FACTORS
 from vinesim.kernels.compilation import PHYSICS_PACKAGES, compile_kernels
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot
@@ -38,7 +40,16 @@ from vinesim.scene.spec import Scene, load_scene
 from vinesim.scene.state import State
 from vinesim.scene.surroundings import Box, main_axis
 from vinesim.scene.terrain import Terrain, on_ground
-from vinesim.scene.values import Breakage, Contact, Detachment, RigidBox, Snapshot
+from vinesim.scene.values import (
+    BladeClosing,
+    Breakage,
+    BunchHistory,
+    Contact,
+    Detachment,
+    FruitEvent,
+    RigidBox,
+    Snapshot,
+)
 from vinesim.scene.wind import Wind, wind_of
 from vinesim.wind.sway import Sway
 from vinesim.world import Physics
@@ -120,6 +131,8 @@ class Simulation:
         self._pushed: set[tuple[str, str]] = set()
         self._detachments: list[Detachment] = []
         self._breakages: list[Breakage] = []
+        self._closings: list[BladeClosing] = []
+        self._fruit_events: list[FruitEvent] = []
         self._primitives: Primitives | None = None
         self._sway = Sway(model)
         self._fault_log = FaultLog(_warn_caller_of_step)
@@ -138,6 +151,8 @@ class Simulation:
         self._check_joints(self.physics.plants.awake)
         self._detachments = []
         self._breakages = []
+        self._closings = []
+        self._fruit_events = []
         for name in self.robots.keys() - set(self.physics.rigid.robots):  # robots that are no longer in the physics
             self._forget_robot(name)
         for _ in range(count):
@@ -148,6 +163,8 @@ class Simulation:
             self.physics.step()
             self._detachments += self.physics.detachments
             self._breakages += self.physics.detachment_monitor.breakages
+            self._closings += self.physics.closings
+            self._fruit_events += self.physics.fruit_monitor.events
         for body, before in self._loads.items():
             self.physics.plants.body_load[body] = before
         if self._loads:  # a tree that fell asleep under its load must move again
@@ -205,6 +222,22 @@ class Simulation:
         """What gave without parting in the last call of :meth:`step`: canes that cracked, ties that slipped or
         broke."""
         return tuple(self._breakages)
+
+    @property
+    def closings(self) -> tuple[BladeClosing, ...]:
+        """Closings of blades that ended in the last call of :meth:`step`: force, energy, depth, and why a blade did not
+        close."""
+        return tuple(self._closings)
+
+    @property
+    def fruit_events(self) -> tuple[FruitEvent, ...]:
+        """Falls of bunches, and berries that burst or fell off, in the last call of :meth:`step`."""
+        return tuple(self._fruit_events)
+
+    def bunch_history(self, bunch: int) -> BunchHistory:
+        """Returns what has happened to a bunch since the start: forces, pressure, drops, time in hands, berries burst
+        and lost. ``bunch``: index in the model."""
+        return self.physics.fruit_monitor.history(checked_index("bunch", bunch, len(self.model.bunch_body), UsageError))
 
     @property
     def faults(self) -> dict[str, int]:
@@ -419,9 +452,12 @@ class Simulation:
         pose: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
         *,
         size: Sequence[float],
+        force: float = np.inf,
+        speed: float = np.inf,
+        kind: Literal["bypass", "anvil", "saw"] = "bypass",
     ) -> Blade:
         """Attach a cutter to a robot's link, or to the link ``body`` of a pusher. :meth:`Blade.close` cuts the wood
-        between its blades in the next step. The cutters of a robot's files are there already
+        between its blades (:attr:`closings` has the result). The cutters of a robot's files are there already
         (:meth:`~vinesim.robot.drives.controlled_robot.Robot.cutter_blades`).
 
         Args:
@@ -429,6 +465,9 @@ class Simulation:
             link: name of its link.
             pose: [7] centre of the mouth in the link's frame: x along the blades, y from one blade to the other.
             size: [3] m, edges of the mouth along x, y and z.
+            force: [N] largest closing force. Blades stall in wood that takes more.
+            speed: [m/s] speed with which the edges approach each other. Infinite: they close within a step.
+            kind: ``bypass``, ``anvil`` or ``saw``.
         """
         if actor not in self.robots and actor not in self.pushers:
             there = ", ".join([*self.robots, *self.pushers]) or "none"
@@ -436,7 +475,13 @@ class Simulation:
         edges = checked_vector("size", size, "m", UsageError)
         if not (edges > 0.0).all():
             raise UsageError(f"size is {size}; give three edges above 0 [m]")
-        return self.physics.add_blade(actor, link, frames.checked_pose("pose", pose, UsageError), 0.5 * edges)
+        for name, value, unit in (("force", force, "N"), ("speed", speed, "m/s")):
+            if isinstance(value, bool) or not (isinstance(value, numbers.Real) and value > 0.0):
+                raise UsageError(f"{name} is {value!r}; give more than 0 {unit}")
+        if kind not in BLADE_FACTORS:
+            raise UsageError(f"kind is {kind!r}; give {', '.join(BLADE_FACTORS)}")
+        pose = frames.checked_pose("pose", pose, UsageError)
+        return self.physics.add_blade(actor, link, pose, 0.5 * edges, force=force, speed=speed, kind=kind)
 
     def add_box(self, box: Box) -> int:
         """Add an open box, which falls if nothing holds it, and return its number."""

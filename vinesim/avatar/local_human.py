@@ -157,6 +157,10 @@ class Closure:
     """[N] Force needed to cut the strongest wood between the blades, whether it was cut or not; 0 without wood."""
     force: float
     """[N] Largest force that the blades can apply."""
+    outcome: str = ""
+    """What came of it, as :attr:`vinesim.interaction.blades.Blade.outcome`."""
+    is_blocked: bool = False
+    """Whether something between the blades cannot be cut: a wire, a post, old wood, or wood thicker than the mouth."""
 
     @property
     def has_cut(self) -> bool:
@@ -171,10 +175,14 @@ class Closure:
             pieces = (("bunch", "bunches", self.bunches), ("cane", "canes", self.canes))
             cut = [f"{count} {one if count == 1 else several}" for one, several, count in pieces if count]
             return f"{shears} cut {' and '.join(cut)}."
+        if self.is_blocked:
+            return f"{shears}: the blade {self.outcome}."
         if self.resistance > self.force:
             takes = f"{self.resistance:,.0f} N"
             gives = f"{self.force:,.0f} N"
-            return f"{shears} are too weak: this wood takes {takes}, they close with {gives}."
+            depth = self.outcome.partition("they cut ")[2]
+            cut = f" They cut {depth}." if depth else ""
+            return f"{shears} are too weak: this wood takes {takes}, they close with {gives}.{cut}"
         if self.resistance > 0.0:
             return f"{shears} cut nothing: the bunch of this peduncle was picked before."
         return f"{shears} missed: there was no wood between the blades."
@@ -193,15 +201,27 @@ class Shears:
         self.side = side
         self._monitor = physics.detachment_monitor
         self._force = model.force
-        self._blade = physics.add_blade(name, f"{side}_hand", model.mouth, model.mouth_half)
+        self._blade = physics.add_blade(
+            name,
+            f"{side}_hand",
+            model.mouth,
+            model.mouth_half,
+            force=model.force,
+            speed=model.speed,
+            kind=model.blade,
+        )
         self._closures = 0
         self._was_closed = False
 
     def control(self, pose: HumanPose) -> None:
-        """Before a step: close the blades if the hand is closed in ``pose`` and was open before."""
+        """Before a step: close the blades if the hand is closed in ``pose`` and was open before, and open them with the
+        hand."""
         is_closed = bool(getattr(pose, f"{self.side}_closed"))
-        if is_closed and not self._was_closed and getattr(pose, f"{self.side}_shears"):
-            self._blade.close(self._force)
+        has_shears = bool(getattr(pose, f"{self.side}_shears"))
+        if is_closed and not self._was_closed and has_shears:
+            self._blade.close()
+        elif not (is_closed and has_shears):
+            self._blade.open()
         self._was_closed = is_closed
 
     def between(self) -> str:
@@ -216,10 +236,18 @@ class Shears:
         return "bunch" if max(weak) >= 0 else "cane"
 
     def closure(self) -> Closure | None:
-        """After a step: return the result if the blades closed in this step, otherwise None."""
+        """After a step: return the result if a closing of the blades ended in this step, otherwise None."""
         blade = self._blade
         if blade.closures == self._closures:
             return None
         self._closures = blade.closures
         bunches = sum(one.bunch >= 0 for one in blade.detachments)
-        return Closure(self.side, bunches, len(blade.detachments) - bunches, blade.resistance, self._force)
+        return Closure(
+            self.side,
+            bunches,
+            len(blade.detachments) - bunches,
+            blade.resistance,
+            self._force,
+            blade.outcome,
+            blade.outcome.startswith("is blocked"),
+        )

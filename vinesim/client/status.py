@@ -11,6 +11,7 @@ from vinesim.client.client import Client
 from vinesim.client.faults import FaultLog, count_faults
 from vinesim.client.rate_loop import RateLoop
 from vinesim.client.recording.bunch_trace import touch_to_motion
+from vinesim.client.vine_events import fruit_report
 from vinesim.robot.tasks.task import Task
 
 _WITHOUT_SENSORS = {
@@ -119,6 +120,7 @@ class Status:
         values |= {
             "environment_bytes_when_far": client.interest_audit.bytes,
             "ticks_touching_when_far": client.interest_audit.ticks_touching,
+            "fruit": fruit_report(client.physics),
             "malformed": client.replicator.counters.malformed,
             "network": client.replicator.counters.to_report(),
         }

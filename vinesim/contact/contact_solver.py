@@ -248,6 +248,11 @@ class ContactSolver:
         assert self._rigid_arrays is not None
         return self._rigid_arrays.listed.actor[other], self._rigid_arrays.listed.link[other]
 
+    @property
+    def geom_bodies(self) -> np.ndarray:
+        """[geom] MuJoCo bodies of the geoms by which contacts of the last step refer to their other side."""
+        return np.zeros(0, int) if self._rigid_arrays is None else self._rigid_arrays.listed.body
+
     # ------------------------------------------------------------------ queries and updates between steps
 
     def nearest_body(self, points: np.ndarray, max_distance: float) -> tuple[float, int] | None:

@@ -141,6 +141,7 @@ class WoodMonitor:
         wood.tie_slip, wood.tie_strength, wood.tie_axis = (
             buffers.arrays[name] for name in ("tie_slip", "tie_strength", "tie_axis")
         )
+        self._strengths = wood
         self._find = plants.launches.wood_stress(
             wood,
             buffers.reach(self._capacity, wp.float32, "wood_capacity"),
@@ -276,6 +277,18 @@ class WoodMonitor:
             Overload(int(bodies[i]), -1, self._cause(int(bodies[i]), wrench), wrench, is_crack=not breaks[i])
             for i, wrench in zip(events.tolist(), wrenches, strict=True)
         ]
+
+    def weaken(self, bunch: int, pull: float, bend: float) -> None:
+        """Leave a peduncle, which is cut in part, the shares ``pull`` and ``bend`` [1] of its strength."""
+        model = self.plants.model
+        slots = self.plants.buffers.slots[self._ends[bunch]]
+        for values, strength in (
+            (self._strengths.pull, pull * model.bunch_pull[bunch]),
+            (self._strengths.bend, bend * model.bunch_bend[bunch]),
+        ):
+            there = values.numpy()
+            there[slots] = strength
+            values.assign(there)
 
     def forget(self, bunch: int) -> None:
         """Forget the load on the peduncle of a bunch that was picked."""

@@ -8,15 +8,16 @@ stays (:meth:`ArticulationSolver.cut`).
 
 from __future__ import annotations
 
-import dataclasses
-import math
+import logging
 
 import numpy as np
 
 from vinesim.contact.contact_solver import ContactSolver
 from vinesim.core import frames
 from vinesim.core.errors import checked_index
+from vinesim.interaction.blades import Blade, BladeGrips, WoodPiece
 from vinesim.interaction.breaking import CRACK, Overload, WoodMonitor, distance_from_base
+from vinesim.interaction.cutting_force import KERF, remaining_strength, shear_force
 from vinesim.interaction.stalk import cut_place, leave_stump, model_pieces, stalk_below, with_settled_stalk, with_stalk
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.rigid.free_bunch import FreeBunch
@@ -24,40 +25,14 @@ from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene.ids import Organ
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.spare_bodies import PLACE_STEP
-from vinesim.scene.values import Breakage, Contact, Detachment
+from vinesim.scene.values import BladeClosing, Breakage, Contact, Detachment
+
+log = logging.getLogger(__name__)
 
 SAME_CUT = 2e-3
 """Wood shorter than this before or beyond a cut [m] is not cut again: a blade that closes twice cuts once."""
 STUB_MASS = 1e-3
 """Mass of the stub that stays on the tree in place of a bunch [kg]."""
-
-
-@dataclasses.dataclass(slots=True)
-class Blade:
-    """The mouth of a cutter: a box fixed to a link. When the blade closes, it cuts the wood that passes through the
-    box."""
-
-    actor: str
-    link: str
-    pose: np.ndarray
-    """[7] pose of the mouth's centre in the link: x along the blades, y from blade to blade, z across their plane."""
-    half: np.ndarray
-    """[3] m, half edges of the mouth. Wood within ``half[1]`` of the centre, in the closing direction, is caught."""
-    force: float = np.inf
-    """[N] Largest closing force."""
-    closing: bool = False
-    closures: int = 0
-    """Number of times the blade has closed so far."""
-    detachments: tuple[Detachment, ...] = ()
-    """Parts that the blade cut off when it last closed."""
-    resistance: float = 0.0
-    """[N] Cutting force of the strongest piece of wood in the mouth at the last closing, whether it was cut or not; 0
-    for an empty mouth."""
-
-    def close(self, force: float = np.inf) -> None:
-        """Close with at most ``force`` [N] and open again. The wood in the mouth is cut at the end of the next step."""
-        self.closing = True
-        self.force = force
 
 
 class DetachmentMonitor:
@@ -72,11 +47,18 @@ class DetachmentMonitor:
     ) -> None:
         """``parameters``: ``detachment_duration`` is the time after which an overloaded peduncle breaks,
         ``cutting_strength`` the strength of wood."""
-        self._cutting_strength = parameters.cutting_strength
+        self._parameters = parameters
         self.plants = plants
         self.rigid = rigid
         self.contact_solver = contact_solver
         self.blades: list[Blade] = []
+        self.grips = BladeGrips(plants, rigid)
+        """Holds the wood between the edges of closing blades."""
+        self.closings: tuple[BladeClosing, ...] = ()
+        """Closings of blades that ended in the last step."""
+        self.notches: dict[int, tuple[float, float]] = {}
+        """Cuts that do not go through, by body: place [m] along the body, and depth as a share of the diameter there.
+        Only this client knows them."""
         self.hand_contacts: tuple[Contact, ...] = ()
         """Forces of hands that hold plants, as contacts. They are used to find the actor who pulled off a bunch. The
         caller writes them.
@@ -98,6 +80,7 @@ class DetachmentMonitor:
         ``check_load``: whether overloaded peduncles break; if not, only cuts are made."""
         if check_load:
             self._detach_overloaded()
+        self.closings = ()
         if any(blade.closing for blade in self.blades):
             self._cut_with_blades()
         self.breakages, self._breakages = tuple(self._breakages), []
@@ -159,27 +142,157 @@ class DetachmentMonitor:
         )
 
     def _cut_with_blades(self) -> None:
-        """Cut the wood in the mouths of closing blades."""
+        """Move the edges of closing blades, and cut the wood between edges that have met."""
         self.plants.forward_kinematics()
         for blade in self.blades:
             if blade.closing:
-                blade.closing = False
-                blade.resistance = 0.0
                 before = len(self._detachments)
-                blade.closures += 1
-                for body in self._bodies_in_mouth(blade).tolist():
-                    resistance = self.cutting_force(body)
-                    blade.resistance = max(blade.resistance, resistance)
-                    if resistance > blade.force:
-                        continue
-                    bunch = int(self._bunch_of[body])
-                    if bunch < 0:
-                        place = self._place_on_cane(blade, body)
-                        if place is not None:
-                            self.cut(body, "blade", blade.actor, place)
-                    elif self.plants.state.bunch_attached[bunch]:
-                        self.pick(bunch, "blade", blade.actor, *self._cut_in_peduncle(blade, bunch))
-                blade.detachments = tuple(self._detachments[before:])
+                for piece in self._close(blade):
+                    if piece.bunch < 0:
+                        self.cut(piece.body, "blade", blade.actor, piece.at)
+                    elif self.plants.state.bunch_attached[piece.bunch]:
+                        self.pick(piece.bunch, "blade", blade.actor, piece.segment, piece.at)
+                if not blade.closing:
+                    blade.detachments = tuple(self._detachments[before:])
+
+    def _close(self, blade: Blade) -> list[WoodPiece]:
+        """Move the edges of a closing blade by one step. Returns the wood to cut off, if the edges have met."""
+        self._find_pieces(blade)
+        obstacle, thickness = self._obstacle(blade)
+        goal = max(blade.gap - blade.speed * self.plants.dt, min(thickness, blade.gap), 0.0)
+        stalled = blade.advance(goal, self.plants.dt, self._parameters.cutting_energy_share)
+        for piece in blade.pieces:
+            if piece.depth > piece.kept:
+                self._notch(piece)
+        is_blocked = not stalled and thickness >= blade.gap > 0.0
+        if blade.gap > 0.0 and not stalled and not is_blocked:
+            return []
+        blade.closing = False
+        blade.closures += 1
+        blade.stalled = stalled or is_blocked
+        pieces, blade.pieces = blade.pieces, []
+        self.grips.release_all(blade)
+        mouth = frames.compose(self.rigid.link_pose(blade.actor, blade.link), blade.pose)
+        thickest = max(pieces, key=lambda one: (one.diameter, -one.segment), default=None)
+        event = BladeClosing(
+            tick=self.plants.tick,
+            actor=blade.actor,
+            link=blade.link,
+            outcome="blocked" if is_blocked else "stalled" if stalled else "cut" if pieces else "missed",
+            sentence=blade.describe(obstacle if is_blocked else "", thickest),
+            force=blade.peak,
+            needed=blade.resistance,
+            energy=blade.energy,
+            body=-1 if thickest is None else thickest.segment,
+            at=0.0 if thickest is None else thickest.at,
+            diameter=0.0 if thickest is None else thickest.diameter,
+            depth=0.0 if thickest is None else thickest.diameter * max(thickest.depth, thickest.kept),
+            position=mouth[:3] if thickest is None else self._position(thickest.segment, thickest.at),
+        )
+        blade.outcome = event.sentence
+        self.closings += (event,)
+        if blade.stalled:
+            log.warning("%s of %s %s", blade.link, blade.actor, blade.outcome)
+            return []
+        for piece in pieces:
+            self.notches.pop(piece.segment, None)
+        return [one for one in pieces if one.bunch >= 0 or self.plants.state.body_cut[one.body] == one.floats]
+
+    def _find_pieces(self, blade: Blade) -> None:
+        """List the wood between the edges of a closing blade: what they have bitten into, and what is in the mouth and
+        not thicker than the gap."""
+        state = self.plants.state
+        parent = self.plants.body_parent
+        kept = [
+            piece
+            for piece in blade.pieces
+            if piece.diameter > blade.gap
+            and state.body_cut[piece.segment] == piece.floats
+            and (piece.bunch < 0 or state.bunch_attached[piece.bunch])
+        ]
+        known = {piece.body for piece in kept} | {int(parent[piece.body]) for piece in kept}
+        for body in self._bodies_in_mouth(blade).tolist():
+            bunch = int(self._bunch_of[body])
+            if body in known or int(parent[body]) in known or any(one.bunch == bunch >= 0 for one in kept):
+                continue
+            piece = self._piece(blade, body, bunch)
+            if piece.diameter <= blade.gap:
+                kept.append(piece)
+        blade.pieces = kept
+
+    def _piece(self, blade: Blade, body: int, bunch: int) -> WoodPiece:
+        """Returns the wood of the branch with ``body`` in a blade's mouth, where the edges would cut it."""
+        model = self.plants.model
+        segment, at = (
+            self._cut_in_peduncle(blade, bunch) if bunch >= 0 else (body, self._place_on_cane(blade, body) or 0.0)
+        )
+        whole = self.plants.stumps.segment_of(segment)
+        radius = model.body_radius[whole].astype(float)
+        length = float(model.body_length[whole])
+        diameter = 2.0 * float(radius[0] + (radius[1] - radius[0]) * at / max(length, 1e-9))
+        notch = self.notches.get(segment)
+        return WoodPiece(
+            body=body,
+            bunch=bunch,
+            segment=segment,
+            at=at,
+            diameter=diameter,
+            force=shear_force(diameter, self._strength(segment)),
+            kept=notch[1] if notch is not None and abs(notch[0] - at) <= KERF else 0.0,
+            depth=0.0,
+            floats=bool(self.plants.state.body_cut[segment]),
+            point=self._in_mouth(blade, self._position(segment, at)),
+        )
+
+    def _notch(self, piece: WoodPiece) -> None:
+        """Record how deep a piece of wood is cut, and weaken its peduncle."""
+        before = self.notches.get(piece.segment)
+        if before is not None and before[1] > piece.depth:
+            return
+        self.notches[piece.segment] = piece.at, piece.depth
+        if piece.bunch >= 0:
+            self.wood.weaken(piece.bunch, *remaining_strength(piece.depth))
+
+    def _obstacle(self, blade: Blade) -> tuple[str, float]:
+        """Returns what the edges of a blade cannot cut, and its thickness [m] between them: a wire, post or old wood in
+        the mouth, or wood that does not fit into it. No obstacle has the thickness 0."""
+        model = self.plants.model
+        mouth = frames.compose(self.rigid.link_pose(blade.actor, blade.link), blade.pose)
+        found = "", 0.0
+        if len(model.fixed_start):
+            reach = float(np.linalg.norm(blade.half)) + model.fixed_radius.max(1)
+            axis = (model.fixed_end - model.fixed_start).astype(float)
+            apart = mouth[:3] - model.fixed_start
+            square = np.maximum(np.einsum("fi,fi->f", axis, axis), 1e-12)
+            share = np.clip(np.einsum("fi,fi->f", apart, axis) / square, 0.0, 1.0)
+            near = np.flatnonzero(np.linalg.norm(apart - share[:, None] * axis, axis=1) < reach)
+            for i in near.tolist():
+                start, end = (
+                    self._in_mouth(blade, one[i].astype(float)) for one in (model.fixed_start, model.fixed_end)
+                )
+                thickness = 2.0 * float(model.fixed_radius[i].max())
+                if thickness > found[1] and _passes_mouth(start, end, 0.5 * thickness, blade.half):
+                    organ = Organ(int(model.fixed_organ[i])).name.lower()
+                    found = f"{organ} {int(model.fixed_index[i])}", thickness
+        if blade.gap == blade.opening:
+            for body in self._bodies_in_mouth(blade).tolist():
+                piece = self._piece(blade, body, int(self._bunch_of[body]))
+                if piece.diameter > max(blade.opening, found[1]):
+                    found = (
+                        f"wood of {1e3 * piece.diameter:.0f} mm, in a mouth of {1e3 * blade.opening:.0f} mm",
+                        piece.diameter,
+                    )
+        return found
+
+    def _position(self, body: int, at: float) -> np.ndarray:
+        """Returns the position [3] m in the world of a place ``at`` [m] along a body."""
+        pose = self.plants.state.body_q[body].astype(float)
+        return pose[:3] + frames.rotate(pose[3:], np.array([at, 0.0, 0.0]))
+
+    def _in_mouth(self, blade: Blade, point: np.ndarray) -> np.ndarray:
+        """Returns a ``point`` [3] m of the world in the frame of a blade's mouth."""
+        mouth = frames.compose(self.rigid.link_pose(blade.actor, blade.link), blade.pose)
+        return frames.rotate(frames.conjugate(mouth[3:]), point - mouth[:3])
 
     def wood_in_mouth(self, blade: Blade) -> list[tuple[int, int]]:
         """Returns the bodies in a blade's mouth after a step, which it would cut with sufficient force. Each body has
@@ -189,10 +302,16 @@ class DetachmentMonitor:
         return [(body, bunch) for body, bunch in found if bunch < 0 or self.plants.state.bunch_attached[bunch]]
 
     def cutting_force(self, body: int) -> float:
-        """Returns the force [N] that cuts a piece of wood: its cross-section at the root end times
-        ``cutting_strength``."""
+        """Returns the largest force [N] of a cut through a piece of wood at its root end, where it is thickest; see
+        :func:`~vinesim.interaction.cutting_force.shear_force`."""
         segment = self.plants.stumps.segment_of(body)
-        return self._cutting_strength * math.pi * float(self.plants.model.body_radius[segment, 0]) ** 2
+        return shear_force(2.0 * float(self.plants.model.body_radius[segment, 0]), self._strength(segment))
+
+    def _strength(self, body: int) -> float:
+        """Returns the largest cutting force per cross-section [Pa] of a piece of wood."""
+        parameters = self._parameters
+        is_peduncle = self.plants.model.body_organ[body] == int(Organ.PEDUNCLE)
+        return parameters.peduncle_cutting_strength if is_peduncle else parameters.cutting_strength
 
     def _bodies_in_mouth(self, blade: Blade) -> np.ndarray:
         """Returns the pieces of wood [k] that a closing blade cuts: their axis passes through its mouth, and the axis
@@ -502,6 +621,20 @@ def _unit_poses(poses: np.ndarray) -> np.ndarray:
     """Returns poses [k, 7] in double precision, with rotations of length 1."""
     poses = poses.astype(float)
     return frames.pose(poses[:, :3], frames.normalize(poses[:, 3:]))
+
+
+def _passes_mouth(start: np.ndarray, end: np.ndarray, radius: float, half: np.ndarray) -> bool:
+    """Returns whether a round bar from ``start`` to ``end`` [3] m, in the frame of a mouth, is between the edges: its
+    axis passes through the box with the half edges ``half`` [3] m, or the middle line of the mouth passes through the
+    bar."""
+    along = end - start
+    along = np.where(np.abs(along) < 1e-12, 1e-12, along)
+    one, other = (-half - start) / along, (half - start) / along
+    if max(np.minimum(one, other).max(), 0.0) <= min(np.maximum(one, other).min(), 1.0):
+        return True
+    line = np.linspace(-half[0], half[0], 9)[:, None] * np.array([1.0, 0.0, 0.0])
+    share = np.clip((line - start) @ along / (along @ along), 0.0, 1.0)
+    return bool(np.linalg.norm(line - start - share[:, None] * along, axis=1).min() < radius)
 
 
 def _box_around(bunch: FreeBunch, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -502,6 +502,16 @@ class RigidWorld(MujocoWorld):
         mujoco.mj_jac(self.mj_model, self.mj_data, jacobian[:3], jacobian[3:], np.asarray(point, float), body)
         return jacobian[:, robot.v]
 
+    def generalised_force(self, name: str, link: str, force: np.ndarray, point: np.ndarray) -> np.ndarray:
+        """Returns the generalised force [dof] of a force [3] N that acts at ``point`` [3] m (world) of a link of a
+        robot or person."""
+        body = self._body_of_object(name, link)
+        result = np.zeros(self.mj_model.nv)
+        mujoco.mj_applyFT(
+            self.mj_model, self.mj_data, np.asarray(force, float), np.zeros(3), np.asarray(point, float), body, result
+        )
+        return result
+
     def add_link_sensor(self, name: str, link: str) -> None:
         """Add a sensor to a link, so that :meth:`link_wrench` and :meth:`link_acceleration` are measured from the next
         step on."""

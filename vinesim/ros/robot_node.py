@@ -10,6 +10,7 @@ import logging
 import pathlib
 import time as wall
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 from xml.etree import ElementTree
 
@@ -35,7 +36,7 @@ from vinesim.ros.publishers.robot import (
     RobotPublisher,
 )
 from vinesim.ros.publishers.sound import SoundPublisher
-from vinesim.ros.topic import RELIABLE, TRANSIENT_LOCAL, FlowControl, PendingMessage, Topic
+from vinesim.ros.topic import EVERY_STEP, RELIABLE, TRANSIENT_LOCAL, FlowControl, PendingMessage, Topic
 from vinesim.scene.values import ComponentStatus, ControllerSpec, HandGestures, Intention, RobotSample
 from vinesim.scene.values.signals import Color
 
@@ -127,6 +128,7 @@ class RobotNode(Node):
         self._send(self._sound.pending_info(), always=True)
         self._intentions = self._advertise(String, "human_intention", TRANSIENT_LOCAL)
         self._gestures = self._advertise(String, "human_gesture", TRANSIENT_LOCAL)
+        self._events = self._advertise(String, "vine/events", EVERY_STEP)
         self._lights = LightsPublisher(self._advertise, self._urdf)
         self._diagnostics = self._advertise(DiagnosticArray, "/diagnostics", RELIABLE)
         self._proprioception = ProprioceptionPublisher(self._advertise, self._imus, self._wrenches)
@@ -155,7 +157,7 @@ class RobotNode(Node):
         declare(
             TRUTH,
             True,
-            "Publish ground truth: tf_environment, vine/contacts, vine/markers.",
+            "Publish ground truth: tf_environment, vine/contacts, vine/events, vine/markers.",
             changed=self._apply_parameters,
         )
         declare(
@@ -177,7 +179,7 @@ class RobotNode(Node):
         self._robot.publishes_map_to_odom = self._parameters[MAP_TO_ODOM]
         self._robot.has_exact_odometry = self._parameters[EXACT_ODOMETRY]
         self._robot.odom_frame = self._parameters[ODOM_FRAME_ID]
-        for publisher in (self._ground_truth, self._contacts):
+        for publisher in (self._ground_truth, self._contacts, self._events):
             publisher.mute(not self._parameters[TRUTH])
 
     @property
@@ -297,6 +299,11 @@ class RobotNode(Node):
         """Publish the gestures that the hands of people show since ``time`` of the world [s]. Subscribers that join
         late receive the last message."""
         self._send([(self._gestures, lambda: convert.gestures(time, gestures))], always=True)
+
+    def publish_events(self, time: float, events: Sequence[Mapping[str, Any]]) -> None:
+        """Publish what happened to plants and fruit in a step that ended at ``time`` of the world [s], one message for
+        each event."""
+        self._send([(self._events, partial(convert.event, time, event)) for event in events])
 
     def publish_lights(self, color: Color | None) -> None:
         """Publish the colour of the indicator lights; call this when it changes. ``color`` is UNLIT between flashes,

@@ -106,7 +106,15 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     detachment_duration: Positive = 0.03
     """[s] A peduncle breaks after it has been overloaded for this time. GUESSED: a peak in one step is not a pull."""
     cutting_strength: Positive = 13.16e6
-    """[Pa] Cutting force per cross-sectional area of the wood. READ: canes of Okuzgozu, JKSUS 2024 36:103034."""
+    """[Pa] Largest cutting force per cross-sectional area of canes. READ: canes of Okuzgozu with leaves, JKSUS 2024
+    36:103034. Dormant canes take 13.9e6 to 21.7e6, Ozdemir et al. 2015; see
+    :mod:`vinesim.interaction.cutting_force`."""
+    peduncle_cutting_strength: Positive = 4.8e6
+    """[Pa] Largest cutting force per cross-sectional area of bunches' peduncles. GUESSED: from a strawberry's, see
+    :mod:`vinesim.interaction.cutting_force`."""
+    cutting_energy_share: Annotated[float, msgspec.Meta(ge=0.01, lt=1.0)] = 0.7853981633974483
+    """[1] Energy of a cut as a share of largest force times diameter. DERIVED: pi/4, force along the chord of the
+    section; dormant canes 0.27, Ozdemir et al. 2015."""
 
     # ------------------------------------------------------------------ contacts with plants
     contact_stiffness: Positive = 2e4

@@ -109,6 +109,7 @@ def push_summary(
         "pictures_per_simulated_second": least_rate(received, PICTURES, simulated),
         "scans_per_simulated_second": least_rate(received, SCANS, simulated),
         **{key: reports[PICKER][key] for key in touch_keys},
+        "fruit": reports[PICKER]["fruit"],
         "loops": loops,
         "remote_displacement_error_mm": remote_error(traces[PICKER], traces[VISITOR]),
         "ros": no_ros or "used",
@@ -221,6 +222,7 @@ def job_summary(
         "detail": report["job"],
         **{key: report[key] for key in LOOP_KEYS},
         "bunches_picked": report["bunches_picked"],
+        "fruit": report["fruit"],
     }
     if with_visitor:
         visitor = report_of(out, VISITOR)

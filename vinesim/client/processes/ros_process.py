@@ -28,6 +28,7 @@ from vinesim.client.sound.exchange import SoundStep
 from vinesim.client.sound.microphone_step import at_place
 from vinesim.client.tasks.ros_command_handler import RosCommandHandler
 from vinesim.client.tasks.simulation_control import SimulationControl
+from vinesim.client.vine_events import events_of
 from vinesim.core import frames
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.controlled_robot import Robot
@@ -245,6 +246,8 @@ class RosProcess:
         run = self.worker.current()
         is_new = run is not self._told_run
         self._told_run = run
+        if events := events_of(physics):
+            run.send("events", (physics.time + client.world_time.offset, events))
         self._tell_of_people(client, run, is_new)
         self._tell_lights(run, is_new)
         truth_period = float(channel.wanted["truth_period"][0])

@@ -227,6 +227,8 @@ class RosWorker(Worker):
             self.node.publish_intentions(value)
         elif kind == "gestures":
             self.node.publish_gestures(*value)
+        elif kind == "events":
+            self.node.publish_events(*value)
         elif kind == "lights":
             self.node.publish_lights(value)
         elif kind == "truth":

@@ -87,6 +87,9 @@ class ObjectSync:
             tracker.blend_towards(list(updates), poses, np.array([update.velocity for update in inbox.objects]), blend)
             tracker.set_moving(list(updates))
         self._remote_updates = updates
+        remote = self.physics.fruit_monitor.remote
+        remote[:] = False
+        remote[[bunch for kind, bunch in map(split_object_id, updates) if kind == ObjectKind.BUNCH]] = True
         self._hold_resting_objects()
         self._activate_dormant_bunches()
 

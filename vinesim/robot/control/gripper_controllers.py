@@ -94,9 +94,9 @@ class FingersController(GripperController):
 class CutterController(GripperController):
     """Closes a cutter once, whatever position the goal has.
 
-    Goal: the largest force of the blades [N]; see :meth:`Robot.command_cutter`. Result: position 0 once closed, and the
-    force [N] that the blades had to overcome, 0 if nothing was between them. The result is ``stalled`` if this force
-    exceeds the largest force, so that nothing was cut.
+    Goal: the largest force of the blades [N]; see :meth:`Robot.command_cutter`. Result: how far the blades are open,
+    from 1 to 0, and the largest force [N] that they exerted, 0 if nothing was between them. The result is ``stalled``
+    if they did not meet, so that nothing was cut off.
     """
 
     def __init__(self, robot: Robot, group: str) -> None:
@@ -104,22 +104,25 @@ class CutterController(GripperController):
         self._closures = tuple(blade.closures for blade in robot.cutter_blades(group))
 
     def start(self, position: float, effort: float | None, time: float) -> None:
-        """Close the cutter at ``time`` [s] with at most ``effort`` [N]; None: the cutter's own limit. ``position``
+        """Close the cutter from ``time`` [s] on with at most ``effort`` [N]; None: the cutter's own limit. ``position``
         is ignored."""
         self.robot.command_cutter(self.group, effort)
         self._closures = tuple(blade.closures for blade in self.robot.cutter_blades(self.group))
 
     def state(self, time: float) -> GripperState:
-        """Returns whether the blades have closed, and the force [N] that they had to overcome."""
+        """Returns how far the blades are open, and the largest force [N] that they exerted."""
         blades = self.robot.cutter_blades(self.group)
+        opening = max(blade.gap / blade.opening if blade.closing or blade.closures else 1.0 for blade in blades)
+        effort = max(blade.peak for blade in blades)
         if any(blade.closures == before for blade, before in zip(blades, self._closures, strict=True)):
-            return GripperState(1.0, 0.0)
-        effort = max(min(blade.resistance, blade.force) for blade in blades)
-        too_weak = any(blade.resistance > blade.force for blade in blades)
-        return GripperState(0.0, effort, stalled=too_weak, reached_goal=not too_weak)
+            return GripperState(opening, effort)
+        stalled = any(blade.stalled for blade in blades)
+        return GripperState(opening, effort, stalled=stalled, reached_goal=not stalled)
 
     def cancel(self, time: float) -> None:
-        """Do nothing, because the blades close within one step."""
+        """Open the blades. The wood stays as deep as it is cut."""
+        for blade in self.robot.cutter_blades(self.group):
+            blade.open()
 
 
 CONTROLLERS: dict[str, type[GripperController]] = {"fingers": FingersController, "cutter": CutterController}

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import pathlib
 from collections.abc import Collection, Container, Iterable, Mapping
-from typing import ClassVar, get_args
+from typing import ClassVar, Literal, get_args
 
 import msgspec
 
@@ -64,6 +64,11 @@ class Cutter(Gripper, frozen=True, tag="cutter"):
     """Centre of the space in ``frame`` [m]."""
     force: float | None = None
     """Largest cutting force [N]. None: everything between the blades is cut."""
+    speed: float = 0.2
+    """Speed with which the edges of the blades approach each other [m/s]. GUESSED: electric shears that close 40 mm in
+    0.2 s."""
+    blade: Literal["bypass", "anvil", "saw"] = "bypass"
+    """How the blades cut; see :data:`~vinesim.interaction.cutting_force.BLADE_FACTORS`."""
 
     @property
     def controller(self) -> str:
@@ -81,6 +86,10 @@ class Cutter(Gripper, frozen=True, tag="cutter"):
             )
         if self.force is not None and not self.force > 0.0:
             raise description_error(file, f"the cutter of {self.group!r} has {self.force} N", "give more than 0")
+        if not self.speed > 0.0:
+            raise description_error(
+                file, f"the cutter of {self.group!r} closes with {self.speed} m/s", "give more than 0"
+            )
         if min(self.half) <= 0.0:
             raise description_error(
                 file, f"the cutter of {self.group!r} has the half edges {self.half}", "give lengths above 0"

@@ -18,7 +18,7 @@ import numpy as np
 
 from vinesim.core import frames
 from vinesim.core.numbers import is_number
-from vinesim.interaction.detachment import Blade
+from vinesim.interaction.blades import Blade
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.joint_servos import CommandError, CommandInterface, JointServos
@@ -92,7 +92,15 @@ class Robot(RobotInstance):
         """Add the cutters of the robot's description to ``physics``, so that grippers act on plants."""
         self._physics = physics
         for cutter in self.description.cutters:
-            blade = physics.add_blade(self.name, cutter.frame, frames.pose(cutter.origin), np.array(cutter.half))
+            blade = physics.add_blade(
+                self.name,
+                cutter.frame,
+                frames.pose(cutter.origin),
+                np.array(cutter.half),
+                force=np.inf if cutter.force is None else cutter.force,
+                speed=cutter.speed,
+                kind=cutter.blade,
+            )
             self._cutters.setdefault(cutter.group, []).append(blade)
 
     def remove(self) -> None:
@@ -187,15 +195,15 @@ class Robot(RobotInstance):
         return travel * float(self.rigid.joint_measurements(self.name)[0][fingers].mean()) + offset
 
     def command_cutter(self, group: str, force: float | None = None) -> None:
-        """Close the cutter of a gripper and open it again. Wood between its blades in the next step is cut.
+        """Close the cutter of a gripper and open it again. The wood between its blades is cut when they meet.
 
-        ``force`` [N]: largest force; the cutter's own limit unless given. Wood that needs more force is not cut.
+        ``force`` [N]: largest force; the cutter's own limit unless given. If the wood needs more force, the blades
+        stall in it (:class:`~vinesim.interaction.blades.Blade`).
         """
         if force is not None and not force > 0.0:
             raise CommandError(f"{self.name}: cutting force {force}; give more than 0, or none for all there is")
-        limits = [cutter.force for cutter in self.description.cutters if cutter.group == group]
-        for blade, limit in zip(self.cutter_blades(group), limits, strict=True):
-            blade.close(min(np.inf if limit is None else limit, np.inf if force is None else force))
+        for blade in self.cutter_blades(group):
+            blade.close(np.inf if force is None else force)
 
     def cutter_blades(self, group: str) -> tuple[Blade, ...]:
         """Returns the blades of a gripper's cutters, which report what they cut. Raises :class:`CommandError` if

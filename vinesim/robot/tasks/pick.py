@@ -202,6 +202,8 @@ class PickBunch(Task):
         for _ in range(MAX_CUTS):
             self.robot.command_cutter(self.arm.gripper)
             yield "cut"
+            while any(blade.closing for blade in self.robot.cutter_blades(self.arm.gripper)):
+                yield "cut"
             if not self.physics.state.bunch_attached[self.plan.bunch]:
                 return
             yield from self.wait(0.2, "cut")

@@ -167,6 +167,11 @@ def gestures(time: float, shown: Iterable[HandGestures]) -> String:
     return String(data=json.dumps({"time": time, "people": people}))
 
 
+def event(time: float, what: Mapping[str, Any]) -> String:
+    """Returns an event of the vineyard, which ended at ``time`` of the world [s], as JSON."""
+    return String(data=json.dumps({"time": time, **what}))
+
+
 def elastic_state(sample: ElasticSample, joint: int) -> JointState:
     """Returns the state of one series elastic element: position of the motor, and torque of the spring."""
     return JointState(

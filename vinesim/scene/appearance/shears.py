@@ -31,6 +31,10 @@ class ShearsFile(Table, frozen=True):
     """[m] Half edges of the space between the blades: along them, from one to the other, across their plane."""
     force: float
     """Largest force of the closing blades [N]."""
+    speed: float
+    """Speed with which the edges of the blades approach each other [m/s]."""
+    blade: Literal["bypass", "anvil", "saw"]
+    """How the blades cut."""
     paints: dict[str, Paint]
     parts: dict[Literal["blade", "hook"], tuple[ShapeSpec, ...]]
 
@@ -51,6 +55,10 @@ class ShearsModel:
     """[3] m, half edges of that box."""
     force: float
     """Largest force of the closing blades [N]."""
+    speed: float
+    """Speed with which the edges of the blades approach each other [m/s]."""
+    blade: str
+    """How the blades cut, see ``vinesim.interaction.cutting_force.BLADE_FACTORS``."""
 
 
 @functools.cache
@@ -58,6 +66,9 @@ def load_shears(name: str = "shears") -> ShearsModel:
     """Returns the shears of ``data/figures``. Raises :class:`AppearanceError` if the file cannot be read."""
     path = find_data_file("figures", name, ".toml")
     file = load_toml(path, ShearsFile, AppearanceError)
+    for name, value in (("force", file.force), ("speed", file.speed)):
+        if not value > 0.0:
+            raise AppearanceError(f"{path}: {name} is {value}; give more than 0")
     parts = {}
     for link in SHEARS_PARTS:
         half: Literal["blade", "hook"] = "blade" if link == "shears_blade" else "hook"
@@ -77,4 +88,6 @@ def load_shears(name: str = "shears") -> ShearsModel:
         mouth=frames.pose(np.array(file.mouth)),
         mouth_half=np.array(file.mouth_half),
         force=file.force,
+        speed=file.speed,
+        blade=file.blade,
     )

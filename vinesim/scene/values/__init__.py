@@ -52,7 +52,18 @@ from vinesim.scene.values.sensors import (
 )
 from vinesim.scene.values.signals import INTENTIONS, TONE_LEVEL, HandGestures, Intention, LightPattern, Lights
 from vinesim.scene.values.status import ComponentStatus
-from vinesim.scene.values.world import Breakage, Contact, Detachment, GivenWood, SegmentPoses, Snapshot, WindState
+from vinesim.scene.values.world import (
+    BladeClosing,
+    Breakage,
+    BunchHistory,
+    Contact,
+    Detachment,
+    FruitEvent,
+    GivenWood,
+    SegmentPoses,
+    Snapshot,
+    WindState,
+)
 
 __all__ = [
     "FORWARD_KINDS",
@@ -62,8 +73,10 @@ __all__ = [
     "SENSOR_KINDS",
     "TONE_LEVEL",
     "Band",
+    "BladeClosing",
     "Box",
     "Breakage",
+    "BunchHistory",
     "BunchTruth",
     "CameraFrame",
     "CameraInfo",
@@ -77,6 +90,7 @@ __all__ = [
     "Drive",
     "ElasticSample",
     "FixKind",
+    "FruitEvent",
     "GivenWood",
     "GnssFix",
     "GnssMount",

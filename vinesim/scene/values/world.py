@@ -168,3 +168,79 @@ class GivenWood:
     """[j] m, float32."""
     broken: np.ndarray
     """[j] bool"""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class BladeClosing:
+    """The event that a blade has closed, or could not close wholly."""
+
+    tick: int
+    actor: str
+    link: str
+    outcome: str
+    """``"cut"`` (the edges met with wood between them), ``"missed"`` (without wood), ``"stalled"`` (the wood takes more
+    force than the blade has) or ``"blocked"`` (a wire, a post, old wood or wood thicker than the mouth is between the
+    edges)."""
+    sentence: str
+    """What happened, for users."""
+    force: float
+    """[N] Largest force that the edges exerted on the wood."""
+    needed: float
+    """[N] Largest force that cutting all wood in the mouth takes."""
+    energy: float
+    """[J] Energy that went into the wood."""
+    body: int
+    """Index of the thickest body between the edges, -1 for none."""
+    at: float
+    """[m] Place of the cut along this body."""
+    diameter: float
+    """[m] Diameter of this body there."""
+    depth: float
+    """[m] Depth of the cut in this body, the cuts of earlier closings included."""
+    position: np.ndarray
+    """[3] m, the place of the cut in the world; the middle of the mouth if there is no wood."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class BunchHistory:
+    """What has happened to a bunch so far; see :mod:`vinesim.interaction.fruit_damage` for the laws and their
+    sources."""
+
+    bunch: int
+    berries: int
+    """Number of its berries."""
+    hand_time: float = 0.0
+    """[s] Time for which robots or people touched or held it."""
+    impulse: float = 0.0
+    """[N s] Sum of the forces of robots and people on it, over time."""
+    peak_force: float = 0.0
+    """[N] Largest force across one 24th of its surface, by anything, over 10 ms."""
+    peak_pressure: float = 0.0
+    """[Pa] Largest pressure in a berry."""
+    drops: int = 0
+    """Number of falls."""
+    drop_height: float = 0.0
+    """[m] Height of the highest fall of its centre of mass."""
+    acceleration: float = 0.0
+    """[m/s^2] Largest acceleration by contacts since it left its vine, over 10 ms."""
+    berries_burst: float = 0.0
+    """Expected number of berries whose skins burst."""
+    berries_lost: float = 0.0
+    """Expected number of berries that fell off."""
+
+    @property
+    def damage(self) -> float:
+        """Share of the berries that burst or fell off, at most 1."""
+        return min((self.berries_burst + self.berries_lost) / max(self.berries, 1), 1.0)
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class FruitEvent:
+    """The event that a bunch fell, or that its berries burst or fell off."""
+
+    tick: int
+    bunch: int
+    what: str
+    """``"dropped"``, ``"burst"`` or ``"lost"``."""
+    value: float
+    """Height of the fall [m], or the expected number of berries that have burst or fallen off so far."""
