@@ -33,6 +33,9 @@ COLORS = {
     Organ.PEDUNCLE: (0.5, 0.62, 0.25, 1.0),
     Organ.BUNCH: (0.3, 0.1, 0.28, 1.0),
     Organ.BOX: CRATE_COLOR,
+    Organ.SPUR: (0.32, 0.27, 0.22, 1.0),
+    Organ.NODE: (0.4, 0.27, 0.15, 1.0),
+    Organ.BUD: (0.5, 0.3, 0.18, 1.0),
 }
 """Colour (red, green, blue, opacity, from 0 to 1) of each organ."""
 

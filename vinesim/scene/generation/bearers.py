@@ -88,20 +88,22 @@ def grow_bearers(scene: Scene, structure: FixedStructure, each: int) -> Seats:
                 bearers.append(dataclasses.replace(bearer, piece=piece))
                 for number, (shoot, at) in enumerate(zip(bearer.shoots, bearer.at, strict=True)):
                     share[shoot] = place
-                    start[shoot], aside[shoot] = _seat(bearer, at, number, axis)
+                    start[shoot], aside[shoot] = _seat(g, bearer, at, number, axis)
     return Seats(tuple(bearers), share, start, aside)
 
 
-def _seat(bearer: Bearer, at: int, number: int, arm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _seat(
+    g: np.random.Generator, bearer: Bearer, at: int, number: int, arm: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns the base [3] m of a shoot at point ``at`` of its bearer, and the vector [3] that turns it away from the
     bearer. ``number``: how many shoots stand before it on the bearer; ``arm``: [point, 3] m, axis of the arm."""
     along = frames.normalize((arm[-1] - arm[0]) * [1.0, 1.0, 0.0])
     if bearer.is_spur:  # the canes of a spur spread along the arm, the upper one follows the spur
         side = along * (1.0 if number % 2 else -1.0)
-        out = side * (0.75 if number == 0 else 0.25)
+        out = side * (0.45 if number == 0 else 0.15) * (0.4 + 1.2 * g.random())
     else:
         side = np.array([0.0, 0.0, 1.0])
-        out = along * 0.1 * (1.0 if number % 2 else -1.0)
+        out = along * 0.2 * g.normal()
     return bearer.points[at] + side * 0.8 * bearer.radius[at], out
 
 

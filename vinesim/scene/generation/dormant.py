@@ -33,7 +33,9 @@ _NODE_OFFSET = 0.7
 """Distance of the first node from the base of a cane, in internodes; leaves in summer stand at the same places."""
 _ON_WIRE = 0.03
 """[m] Depth below the fruiting wire down to which a fruiting cane is tied to it."""
-_BUD_LEAN = 0.55
+_BUD_FOOT = 1.12
+"""Distance of a bud's base from the axis of its cane, in radii of the cane: it stands on the swelling of its node."""
+_BUD_LEAN = 0.7
 """Tangent of the angle between a bud and its cane. GUESSED from photographs."""
 
 
@@ -291,7 +293,7 @@ def _place_nodes(scene: Scene, vines: Vines, canes: _Canes, state: SeasonState) 
             local = frames.rotate(frames.conjugate(turn), side) * [0.0, 1.0, 1.0]
             local = frames.normalize(local)
             wide = shoots.base[shoot] + (0.5 * dormant.tip_diameter.value - shoots.base[shoot]) * place / way[-1]
-            foot = local * 0.9 * wide[:, None] + along[:, None] * [1.0, 0.0, 0.0]
+            foot = local * _BUD_FOOT * wide[:, None] + along[:, None] * [1.0, 0.0, 0.0]
             points_to = frames.normalize(local * _BUD_LEAN + [1.0, 0.0, 0.0])
             tall = dormant.bud_length.at(g.random(many))
             part = {
