@@ -36,22 +36,28 @@ def wood_classes(
     return np.where(two_year, int(Organ.SPUR), organ), np.where(cane >= 0, cane, index)
 
 
-def wood_tints(model: Model, bodies: np.ndarray, tint: np.ndarray) -> np.ndarray:
-    """Returns the colour [k, 3] of ``bodies`` [k], linear RGB: last year's canes are brown up to their tips, no longer
-    with the same brown on every cane; two-year wood is grey. ``tint``: [k, 3] in vineyards without dormant wood."""
+def wood_looks(
+    model: Model, bodies: np.ndarray, material: np.ndarray, tint: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns material [k] and colour [k, 3], linear RGB, of ``bodies`` [k]. Last year's canes are brown up to their
+    tips, each with a brown of its own; two-year wood has grey bark. ``material``, ``tint``: those in vineyards without
+    dormant wood."""
     canes = model.canes
     if not len(canes.body):
-        return tint
+        return material, tint
     wood = model.look.palette.wood
     cane = canes.of_bodies(len(model.body_mass))[bodies]
     rng = np.random.default_rng(6)
     bright = rng.uniform(0.75, 1.3, (len(canes.body), 1))
     pale = rng.uniform(0.25, 0.85, (len(canes.body), 1))
     grey = np.array(wood.bark_light)
-    young = bright * ((1.0 - pale) * np.array(wood.cane) + pale * 1.25 * grey)
+    young = 0.8 * bright * ((1.0 - pale) * np.array(wood.cane) + pale * 1.2 * grey)
     old = 0.85 * bright * (0.75 * grey + 0.25 * np.array(wood.cane))
-    chosen = np.where(canes.year[:, None] == 2, old, young)
-    return np.where((cane >= 0)[:, None], chosen[cane], tint)
+    is_old = canes.year == 2
+    chosen = np.where(is_old[:, None], old, young)
+    kind = np.where(is_old, int(materials.BARK), int(materials.CANE))
+    dormant = cane >= 0
+    return np.where(dormant, kind[cane], material), np.where(dormant[:, None], chosen[cane], tint)
 
 
 def dormant_batches(model: Model) -> list[Batch]:
@@ -63,7 +69,7 @@ def dormant_batches(model: Model) -> list[Batch]:
     tree = model.body_tree[body]
     share = np.clip(nodes.along / np.maximum(model.body_length[body], 1e-6), 0.0, 1.0)
     r = model.body_radius[body, 0] * (1.0 - share) + model.body_radius[body, 1] * share
-    tint = 0.8 * wood_tints(model, body, np.zeros((len(body), 3)))
+    tint = 0.8 * wood_looks(model, body, np.zeros(len(body), int), np.zeros((len(body), 3)))[1]
     zero = np.zeros(len(body))
     swollen = [
         make_batch(

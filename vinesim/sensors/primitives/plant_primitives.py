@@ -13,7 +13,7 @@ from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.palette import DEFAULT, LeafColours
 from vinesim.sensors.primitives import textures
-from vinesim.sensors.primitives.dormant_primitives import wood_classes, wood_tints
+from vinesim.sensors.primitives.dormant_primitives import wood_classes, wood_looks
 from vinesim.sensors.primitives.primitive_batches import Batch, make_batch, stack_columns
 from vinesim.sensors.raster.primitive_arrays import CONE, LEAF
 
@@ -48,8 +48,8 @@ def cane_batch(model: Model) -> Batch:
     green = np.where(organ == int(Organ.PEDUNCLE), 1.0, green)[:, None]
     wood = model.look.palette.wood
     tint = (1.0 - green) * np.array(wood.cane) * (0.7 + 0.6 * seed[tree, None]) + green * np.array(wood.stem)
-    tint = wood_tints(model, bodies, tint)
     material = np.where(green[:, 0] > 0.5, int(materials.STEM), int(materials.CANE))
+    material, tint = wood_looks(model, bodies, material, tint)
     length = model.body_length[bodies]
     zero = np.zeros(len(bodies))
     return make_batch(
