@@ -37,7 +37,7 @@ class TieTable:
         self._max_bodies = max_bodies
         self._max_hands = max_hands
         self._model_ties = len(model.tie_body)
-        self._model_body = np.unique(model.tie_body)
+        self._tie_body = model.tie_body.copy()
         bodies = len(model.body_mass)
         self._max_model_ties = int(np.bincount(model.tie_body, minlength=bodies).max(initial=0))
         self._span_size = self._max_model_ties + max_hands
@@ -74,8 +74,9 @@ class TieTable:
 
     @property
     def tied_bodies(self) -> np.ndarray:
-        """Bodies with ties [k]."""
-        return np.append(self._model_body, np.array(self.held_bodies, np.int32))
+        """Bodies with ties that hold them [k]."""
+        bound = np.unique(self._tie_body[self.stiffness[: self._model_ties] > 0.0])
+        return np.append(bound, np.array(self.held_bodies, np.int32))
 
     def add(self, body: int, point: np.ndarray, pose: np.ndarray, stiffness: float, damping: float) -> int:
         """Tie the point ``point`` [3] m of a body's frame to its present place in the world. ``pose`` [7]: world pose
@@ -108,6 +109,20 @@ class TieTable:
         if not self.stiffness[start : start + self._max_hands].any():
             del self._slot_of[body]
             self.span[body] = self._model_span[body]
+
+    def release(self, tie: int) -> int:
+        """Open a tie of the model, so that it holds nothing. Returns the body that it held."""
+        body = int(self._tie_body[tie])
+        for row in self._rows(body, tie):
+            self.stiffness[row] = self.damping[row] = self.softening[row] = 0.0
+        return body
+
+    def _rows(self, body: int, tie: int) -> list[int]:
+        """Returns the rows of a tie of the model: its own, and its copy while hands hold its body."""
+        if body not in self._slot_of:
+            return [tie]
+        copies = self._model_ties + self._span_size * self._slot_of[body]
+        return [tie, copies + tie - int(self._model_span[body, 0])]
 
     def _hands_start(self, body: int) -> int:
         return self._model_ties + self._span_size * self._slot_of[body] + self._max_model_ties
