@@ -142,3 +142,28 @@ def test_a_push_at_a_bud_is_the_force_on_that_bud(spurs: Model) -> None:
 
 def generate_rest(model: Model) -> np.ndarray:
     return model.forward_kinematics(model.joint_settled)
+
+
+def test_buds_stay_with_the_stump_that_pruning_leaves(spurs: Model) -> None:
+    """A cut beyond the second bud leaves two buds on the stump, within 2 mm of where they were; the others fall."""
+    nodes = spurs.nodes
+    canes = spurs.canes
+    for cane in np.flatnonzero(canes.year == 1)[3:30:9].tolist():
+        mine = np.flatnonzero(nodes.cane == cane)
+        simulation = Simulation(without_ties(spurs))
+        body = int(nodes.body[mine[1]])
+        at = float(nodes.along[mine[1]]) + 0.01
+        if at > spurs.body_length[body]:
+            at -= float(spurs.body_length[body])
+            body += 1
+        before = nodes.positions(simulation.state.body_q)
+        simulation.cut(body, at)
+        simulation.step(60)
+        simulation.physics.update_kinematics()
+        state = simulation.state
+        carrier = nodes.carriers(state.stump_of, state.stump_end)
+        moved = np.linalg.norm(nodes.positions(state.body_q, carrier) - before, axis=1)
+        assert moved[mine[:2]].max() < 2e-3
+        assert moved[mine[2:]].min() > 0.1
+        others = np.setdiff1d(np.arange(len(nodes.body)), np.flatnonzero(nodes.cane == cane))
+        assert moved[others[nodes.rank[others] < 2]].max() < 0.02

@@ -35,8 +35,8 @@ def test_flowering_and_veraison_follow_the_sum_of_temperatures() -> None:
 
 
 def test_the_dates_of_latium() -> None:
-    """Budburst in the first half of April, flowering at the end of May, veraison in July, harvest of table grapes in the
-    middle of September."""
+    """Buds burst in the first half of April, vines flower at the end of May, berries turn in July, and table grapes are
+    picked in the middle of September."""
     dates = [CALENDAR.budburst, CALENDAR.flowering, CALENDAR.veraison, CALENDAR.maturity]
     for day, (first, last) in zip(dates, ((91, 106), (141, 152), (182, 213), (250, 265)), strict=True):
         assert first <= day <= last

@@ -11,7 +11,7 @@ from vinesim.core import frames
 from vinesim.scene import spec as scenes
 from vinesim.scene.camera_geometry import pixel_rays
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.ids import LABEL_STRIDE, Organ
+from vinesim.scene.ids import LABEL_STRIDE, Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.values import CameraInfo
 from vinesim.sensors import ground_truth
@@ -20,6 +20,7 @@ from vinesim.sensors.export.dataset import DatasetPlan
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.export.mix import load_mix
 from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
+from vinesim.world import Physics
 
 pytestmark = pytest.mark.slow
 
@@ -115,3 +116,34 @@ def test_a_data_set_of_dormant_vines_has_their_nodes(tmp_path: pathlib.Path) -> 
             rows, columns = np.nonzero((organ == Organ.NODE) & (index == node))
             apart = np.hypot(rows - one["pixel"][1], columns - one["pixel"][0])
             assert apart.min() < 4.0
+
+
+def test_labels_of_a_pruned_cane_are_those_of_its_parts() -> None:
+    """The stump keeps the label of its cane, its node and its bud; what falls takes its own with it."""
+    model = generate(scenes.load_scene("winter_spur"))
+    nodes = model.nodes
+    cane = int(np.flatnonzero(model.canes.year == 1)[4])
+    mine = np.flatnonzero(nodes.cane == cane)
+    body, at = int(nodes.body[mine[1]]), float(nodes.along[mine[1]]) + 0.008
+    physics = Physics(model)
+    primitives = Primitives(model, grass=0.0)
+    physics.cut(body, at)
+    for _ in range(40):
+        physics.step()
+    snapshot = physics.snapshot()
+    primitives.update(snapshot)
+    state = physics.state
+    stump = int(np.flatnonzero(state.stump_of == body)[0])
+    columns = primitives.local_columns(slice(0, primitives.plant_count))
+    names = primitives.label[: primitives.plant_count]
+    on_stump = set(names[columns["carrier"] == stump].tolist())
+    carrier = nodes.carriers(state.stump_of, state.stump_end)
+    kept = np.flatnonzero(carrier == stump)
+    assert mine[1] in kept
+    wanted = {label(Organ.CANE, cane)}
+    wanted |= {label(Organ.NODE, int(node)) for node in kept} | {
+        label(Organ.BUD, int(nodes.bud[node])) for node in kept
+    }
+    assert on_stump == wanted
+    fallen = {label(Organ.BUD, int(nodes.bud[node])) for node in mine if carrier[node] == body}
+    assert fallen <= set(names[columns["carrier"] == body].tolist())

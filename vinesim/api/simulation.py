@@ -377,8 +377,8 @@ class Simulation:
             to: [3] m, the point to which the place is tied; unless given, beside the nearest wire, which does not
                 yield to this tie.
 
-        The tree stays awake. Raises :class:`UsageError` if no wire is near. As many bodies can be tied or held at once as the physics
-        parameter ``max_held_bodies`` says.
+        The tree stays awake. As many bodies can be tied or held at once as the physics parameter ``max_held_bodies``
+        says. Raises :class:`UsageError` if no wire is near.
         """
         if to is not None:
             to = checked_vector("to", to, "m", UsageError)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import pathlib
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -91,7 +92,8 @@ def generate(scene: Scene) -> Model:
     inputs = (plants, parameters, imported, ground, curves)
     digest = disk_cache.source_digest(_code_digest(), msgspec.json.encode(inputs))
     arrays = disk_cache.load_or_make("vineyard", digest, make)
-    model = Model(terrain=terrain, look=Look.of(scene), **{name: arrays[name] for name in Model.array_fields()}).check()
+    fields: dict[str, Any] = {name: arrays[name] for name in Model.array_fields()}
+    model = Model(terrain=terrain, look=Look.of(scene), **fields).check()
     for part, kind in _DORMANT_TABLES.items():
         table = kind(**{name: arrays[f"{part}.{name}"] for name in kind.array_fields()})
         setattr(model, part, table.check())
