@@ -14,6 +14,7 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.season import load_season
 from vinesim.scene.state import State
+from vinesim.scene.summary import summary_rows
 from vinesim.scene.surroundings import main_axis
 
 pytestmark = pytest.mark.slow
@@ -175,3 +176,12 @@ def test_a_tendone_may_be_dormant() -> None:
     model = generate_uncached(msgspec.structs.replace(scene, date=datetime.date(2026, 1, 15)))
     assert len(model.nodes.body) > 0
     assert len(model.leaf_body) == 0
+
+
+def test_the_summary_counts_canes_nodes_and_buds(winter: tuple[scenes.Scene, Model]) -> None:
+    scene, model = winter
+    rows = {name: value for name, value, _ in summary_rows(scene, model)}
+    assert rows["date"] == f"15 January, dormant, {scene.pruning} pruning"
+    nodes = model.nodes
+    counts = (model.canes.year == 1).sum(), len(nodes.body), (nodes.bud >= 0).sum()
+    assert rows["dormant canes, nodes, buds"] == ", ".join(str(count) for count in counts)
