@@ -2,6 +2,7 @@
 
 import datetime
 import itertools
+import re
 
 import msgspec
 import numpy as np
@@ -22,6 +23,21 @@ SMALL = scenes.Layout(rows=1, vines=2, row_spacing=2.6, vine_spacing=2.0, height
 def on(month: int, day: int, **changes: object) -> scenes.Scene:
     scene = scenes.load_scene("vsp")
     return msgspec.structs.replace(scene, layout=SMALL, date=datetime.date(2026, month, day), **changes)
+
+
+def test_every_number_of_the_season_has_a_source() -> None:
+    count = 0
+    for table in CURVES.__struct_fields__:
+        part = getattr(CURVES, table)
+        for name in part.__struct_fields__:
+            number = getattr(part, name)
+            count += 1
+            assert len(number.source) > 15, name
+            if number.grade == "READ":
+                assert re.search(r"\b(19|20)\d\d\b", number.source), name
+            elif number.grade == "DERIVED":
+                assert re.search(r"\d", number.source), name
+    assert count == 34
 
 
 def test_flowering_and_veraison_follow_the_sum_of_temperatures() -> None:
