@@ -100,6 +100,11 @@ def test_the_forms_of_a_year_follow_each_other() -> None:
     assert fruit[0] == np.ceil(CALENDAR.flowering + 4.0)
 
 
+def test_imported_plants_have_no_leaves_in_winter_either() -> None:
+    assert [scenes.on_its_date(on(*date)).season.leafiness for date in ((1, 15), (4, 15), (12, 20))] == [0.0] * 3
+    assert scenes.on_its_date(on(7, 1)).season.leafiness == 0.85
+
+
 def test_a_leap_day_is_a_day_of_the_year() -> None:
     assert season.day_of_year(datetime.date(2028, 2, 29)) == 60
     assert season.day_of_year(datetime.date(2028, 12, 31)) == 365

@@ -158,7 +158,7 @@ class SeasonState:
     unfolded: float
     """Number of leaves that have unfolded on a shoot that is never topped."""
     shown: float
-    """Share of the leaves that have not fallen."""
+    """Share of the leaves that have not fallen; 0 in winter."""
     yellow: float
     """Share of the leaves that have turned yellow."""
     woody: float
@@ -327,7 +327,7 @@ def state_on(
         form=form,
         calendar=calendar,
         unfolded=unfolded,
-        shown=1.0 - _ramp(day, first_fallen, last_fallen),
+        shown=1.0 - _ramp(day, first_fallen, last_fallen) if form == "growing" else 0.0,
         yellow=_ramp(day, *stages.leaf_turn.value),
         woody=_ramp(day, calendar.flowering, calendar.maturity),
         berry_mass=mass,
