@@ -85,8 +85,9 @@ class TieTable:
         return list(self._slot_of)
 
     def are_tied(self, bodies: np.ndarray) -> np.ndarray:
-        """Returns whether each of the ``bodies`` [k] has ties."""
-        return self.span[bodies, 1] > self.span[bodies, 0]
+        """Returns whether each of the ``bodies`` [k] has ties that hold it."""
+        before = np.concatenate([[0], np.cumsum(self.stiffness > 0.0)])
+        return before[self.span[bodies, 1]] > before[self.span[bodies, 0]]
 
     def number_on_body(self, ties: np.ndarray) -> np.ndarray:
         """Returns the number [k] of each of the model's ``ties`` [k] among those of its body, from 0."""
@@ -116,12 +117,6 @@ class TieTable:
                 self.span[one] = self._model_span[one]
         self.changes += 1
 
-    @property
-    def tied_bodies(self) -> np.ndarray:
-        """Bodies with ties that hold them [k]."""
-        holds = self.stiffness[: self._model_ties] > 0.0
-        return np.append(np.unique(self.tie_body[holds]), np.array(self.held_bodies, np.int32))
-
     def rows_of(self, tie: int) -> list[int]:
         """Returns the rows of a tie of the model: its own, and its copy if hands hold the body."""
         body = int(self.tie_body[tie])
@@ -131,7 +126,7 @@ class TieTable:
     def release(self, tie: int) -> None:
         """Let a tie of the model hold nothing any more."""
         rows = self.rows_of(tie)
-        self.stiffness[rows] = self.damping[rows] = 0.0
+        self.stiffness[rows] = self.damping[rows] = self.softening[rows] = 0.0
 
     def slide(self, tie: int, way: np.ndarray) -> None:
         """Move the anchor of a tie of the model by ``way`` [3] m."""

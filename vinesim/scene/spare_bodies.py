@@ -60,4 +60,7 @@ def with_spares(model: Model, count: int = SPARES) -> Model:
     spared.body_inertia[spare] = _INERTIA
     spared.terrain = model.terrain
     spared.look = model.look
+    spared.nodes, spared.canes = model.nodes.copy(), model.canes.copy()
+    for part in (spared.nodes, spared.canes):
+        part.body[:] = moved[part.body] if bodies else part.body
     return spared.check()

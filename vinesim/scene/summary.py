@@ -7,7 +7,7 @@ import numpy as np
 from vinesim.core import frames
 from vinesim.scene import leaves
 from vinesim.scene.model import Model
-from vinesim.scene.spec import Scene
+from vinesim.scene.spec import Scene, season_of
 
 
 def summary_rows(scene: Scene, model: Model) -> list[tuple[str, str, str]]:
@@ -20,8 +20,15 @@ def summary_rows(scene: Scene, model: Model) -> list[tuple[str, str, str]]:
     bent = np.linalg.norm(frames.log(model.joint_settled.astype(float)), axis=1)
     memory = sum(getattr(model, name).nbytes for name in model.array_fields())
     fruit = model.body_mass[model.bunch_body].sum()
+    state = season_of(scene)
+    dated = [] if state is None else [("date", f"{scene.date:%d %B}, {state.form}, {scene.pruning} pruning", "")]
+    nodes = model.nodes
+    if len(nodes.body):
+        last = int((model.canes.year == 1).sum())
+        dated += [("dormant canes, nodes, buds", f"{last}, {len(nodes.body)}, {int((nodes.bud >= 0).sum())}", "")]
     return [
         ("scene", f"{scene.name}, {scene.training}, seed {scene.seed}", ""),
+        *dated,
         ("ground", f"{ground:.0f}", "m^2"),
         ("vines", f"{vines}", ""),
         ("trees (shoots)", f"{counts['tree']}", ""),

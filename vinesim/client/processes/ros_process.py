@@ -107,6 +107,8 @@ class RosProcess:
             tuple(mount.name for mount in description.wrenches),
             interest_radius,
             params_file,
+            cane_count=len(model.canes.body),
+            bud_count=int(model.nodes.bud.max(initial=-1)) + 1,
         )
         self._visuals: tuple[RigidVisual, ...] | None = None
         """All rigid bodies of the world when the list of bodies in the ground truth was made."""
@@ -299,6 +301,12 @@ class RosProcess:
             truth["time"][0] = physics.time + client.world_time.offset
             truth["attached"][:] = physics.state.bunch_attached
             truth["bunch_q"][:] = physics.state.body_q[self._model.bunch_body]
+            canes = self._model.canes.body
+            truth["dormant_q"][: len(canes)] = physics.state.body_q[canes]
+            nodes = self._model.nodes
+            state = physics.state
+            carrier = nodes.carriers(state.stump_of, state.stump_end)
+            truth["dormant_q"][len(canes) :] = nodes.bud_poses(state.body_q, carrier)
             truth["version"][0] = self._truth_list.version
             self._truth_list.memory["visual_q"][: len(self._truth_rows)] = physics.visual_q()[self._truth_rows]
 

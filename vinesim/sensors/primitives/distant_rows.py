@@ -81,7 +81,9 @@ def distant_batches(model: Model, static_carrier: int) -> list[Batch]:
     place = _vines(yard, is_open)
     if len(place) > MAX_VINES:
         place = place[np.sort(rng.choice(len(place), MAX_VINES, replace=False))]
-    parts = [_wood(model, yard, rng, place, static_carrier), *_clumps(model, yard, rng, place, static_carrier)]
+    parts = [_wood(model, yard, rng, place, static_carrier)]
+    if not len(model.nodes.body):  # dormant vines have no leaves
+        parts += _clumps(model, yard, rng, place, static_carrier)
     parts += _trees(model, yard, rng, is_open, static_carrier)
     return [part for part in parts if len(part)]
 

@@ -27,6 +27,7 @@ from vinesim.sensors.primitives import textures
 from vinesim.sensors.primitives.bunch_primitives import Ripeness, bunch_batches, bunch_bodies
 from vinesim.sensors.primitives.clutter import clutter_batches
 from vinesim.sensors.primitives.distant_rows import distant_batches, shaded_extent
+from vinesim.sensors.primitives.dormant_primitives import dormant_batches
 from vinesim.sensors.primitives.leaf_area_density import LeafDensity
 from vinesim.sensors.primitives.palette_colours import colour_struct
 from vinesim.sensors.primitives.plant_primitives import cane_batch, leaf_batches
@@ -64,7 +65,7 @@ seen."""
 _ONLY_IN_COLUMNS = ("a", "b", "c", "d", "material", "tint", "organ", "label", "carrier")
 """Fields of :class:`ClusterLayout` with a value for each primitive; after loading they are only in the device's
 columns."""
-_CUT_COLUMNS = ("local_a", "local_b", "local_c", "tint", "material", "sky", "carrier")
+_CUT_COLUMNS = ("local_a", "local_b", "local_c", "tint", "material", "sky", "organ", "label", "carrier")
 """Columns of primitives that a cut of a cane changes."""
 _CLUSTER_COLUMNS = {**dict.fromkeys(("first", "size", "cluster_kind", "shown"), wp.int32), "ball": wp.vec4}
 """Columns of the table of clusters: name -> type."""
@@ -240,7 +241,7 @@ class Primitives:
         corners ``low`` and ``high`` [2] m."""
         model = self.model
         static = self._static_carrier
-        batches = [cane_batch(model), *leaf_batches(model)]
+        batches = [cane_batch(model), *leaf_batches(model), *dormant_batches(model)]
         every = np.arange(len(model.bunch_body))
         pieces = [bunch_bodies(model, int(bunch)) for bunch in every]
         batches += bunch_batches(model, every, None, pieces, model.body_tree[model.bunch_body], self._ripeness)
@@ -399,6 +400,7 @@ class Primitives:
             self._whole[row] = {name: values[k : k + 1].copy() for name, values in whole.items()}
             for name in drawn:
                 self._columns[name][row : row + 1].assign(drawn[name][k : k + 1])
+        self.label, self.organ = (self._columns[name][: self.count].numpy() for name in ("label", "organ"))
         self._know([*self._whole])
         return trees
 
@@ -410,10 +412,16 @@ class Primitives:
         carrier = columns["carrier"]
         place = start[:, 0].astype(float)
         organ, material = (self._columns[name].numpy()[rows] for name in ("organ", "material"))
-        is_wood = (organ == int(Organ.CANE)) & (start[:, :3] == 0.0).all(1) & (end[:, 1:3] == 0.0).all(1)
+        is_wood = np.isin(organ, (Organ.CANE, Organ.SPUR)) & (start[:, :3] == 0.0).all(1) & (end[:, 1:3] == 0.0).all(1)
         place[is_wood] = np.nan
         is_node = (organ == int(Organ.CANE)) & (material == int(materials.CANE)) & ~is_wood
         place[is_node] += 7.0 / 11.0 * (end[is_node, 0] - start[is_node, 0])
+        nodes = model.nodes
+        index = self._columns["label"].numpy()[rows] % LABEL_STRIDE
+        of_bud = np.flatnonzero(nodes.bud >= 0)  # buds are numbered in the order of their nodes
+        for kind, along in ((Organ.NODE, nodes.along), (Organ.BUD, nodes.along[of_bud])):
+            here = organ == int(kind)
+            place[here] = along[index[here]]
         for body in np.unique(carrier).tolist():
             leaves = np.flatnonzero(model.leaf_body == body)
             here = np.flatnonzero((carrier == body) & (material == int(materials.FOLIAGE)))
