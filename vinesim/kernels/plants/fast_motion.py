@@ -23,7 +23,7 @@ motion: a change of scheme twice in each swing would remove energy. It does not 
 * where phi = 1 is requested, or geometric stiffness is switched off;
 * with a cut-off part, whose momentum is corrected after the whole step;
 * if its first mode is so fast that its step is divided into substeps;
-* if a joint turns faster than half of ``max_rate``, near which rates are limited.
+* if a joint turns faster than half of ``max_rate``, or would turn faster than ``max_rate``, where rates are limited.
 """
 
 import warp as wp
@@ -98,12 +98,13 @@ def is_fast(
 def solve_part(
     p: SolverParameters,
     parts: int,
+    plain: bool,
     elapsed: float,
     model: ArticulationModel,
     forces: AppliedForces,
     tree: int,
-    part_model: ArticulationModel,
-    part_forces: AppliedForces,
+    part_model_out: ArticulationModel,
+    part_forces_out: AppliedForces,
     joints_out: JointState,
     bodies_out: BodyState,
     factors_out: Factors,
@@ -112,26 +113,31 @@ def solve_part(
 ):
     """Move the joints of a tree over one of ``parts`` equal parts of the step, with backward Euler.
 
-    elapsed: [s] time between the start of the step and that of the part. part_model, part_forces: like ``model`` and
-    ``forces``, but their dampings, anchors and root turns are scratch. The dampings get on top what backward Euler
-    itself adds, because a prediction subtracts it. Anchors and turns get their values at the start of the part.
+    plain: as other trees with phi = 1 do, with the drag, and with the damping that backward Euler adds subtracted.
+    elapsed: [s] time between the start of the step and that of the part. part_model_out, part_forces_out: like
+    ``model`` and ``forces``, but their dampings, anchors and root turns are scratch. Unless ``plain``, the dampings get
+    on top what backward Euler itself adds, because a prediction subtracts it. Anchors and turns get their values at the
+    start of the part.
     """
     divided = substep_parameters(p, parts)
-    divided.fast_rate = NO_DRAG
-    divided.euler_levers = 1.0
+    added = float(0.0)  # [s] damping that backward Euler adds
+    if not plain:
+        divided.fast_rate = NO_DRAG
+        divided.euler_levers = 1.0
+        added = divided.dt
     first = model.tree_first[tree]
     end = first + model.tree_moving[tree] * model.pitch
-    part_forces.root_turn[tree] = forces.root_turn[tree] + elapsed * forces.root_turn_rate[tree]
+    part_forces_out.root_turn[tree] = forces.root_turn[tree] + elapsed * forces.root_turn_rate[tree]
     for k in range(first, end, model.pitch):
-        part_model.joint_damping[k] = model.joint_damping[k] + divided.dt * model.joint_stiffness[k]
+        part_model_out.joint_damping[k] = model.joint_damping[k] + added * model.joint_stiffness[k]
         ties = model.tie_span[k]
         for t in range(ties[0], ties[1]):
-            part_model.tie_damping[t] = model.tie_damping[t] + divided.dt * model.tie_stiffness[t]
-            part_forces.tie_anchor[t] = forces.tie_anchor[t] + elapsed * forces.tie_anchor_velocity[t]
+            part_model_out.tie_damping[t] = model.tie_damping[t] + added * model.tie_stiffness[t]
+            part_forces_out.tie_anchor[t] = forces.tie_anchor[t] + elapsed * forces.tie_anchor_velocity[t]
     predict_tree(
         divided,
-        part_model,
-        part_forces,
+        part_model_out,
+        part_forces_out,
         joints_out,
         tree,
         1.0,
@@ -196,9 +202,9 @@ def move_fast_trees(
     tree_euler_steps: wp.array(dtype=wp.int32),
     forces: AppliedForces,
     # out
-    fast: FastScratch,
-    part_model: ArticulationModel,
-    part_forces: AppliedForces,
+    fast_out: FastScratch,
+    part_model_out: ArticulationModel,
+    part_forces_out: AppliedForces,
     tree_fast_steps_out: wp.array(dtype=wp.int32),
     tree_moved_out: wp.array(dtype=wp.bool),
     tree_phi_out: wp.array(dtype=float),
@@ -210,13 +216,13 @@ def move_fast_trees(
 ):
     """One thread per tree, before the integration of whole steps. Move the joints of fast trees to the end of the step.
 
-    trees: [thread] index of the tree. tree_phi: [tree] requested phi (implicitness of the integrator, 0.5 trapezoidal to
-    1 backward Euler). tree_rate: [tree] rad/s, largest joint rate after the last step. tree_euler_steps: [tree] number of steps still to be taken with phi = 1. fast,
-    part_model, part_forces, factors_out, solve_out: scratch; see :func:`solve_part`. tree_fast_steps_out: [tree] number
-    of steps for which the tree still counts as fast. tree_moved_out: [tree] whether the
-    tree was moved. tree_phi_out: [tree] 1 for a tree that was moved. joints_out: [body] of a tree that was moved, at
-    the end of the step. bodies_out: motion at the start of the step; of a tree that was moved, at the start of the
-    second half. prediction_out: accelerations over the second half, joint rates at the end.
+    trees: [thread] index of the tree. tree_phi: [tree] requested phi (implicitness of the integrator, 0.5 trapezoidal
+    to 1 backward Euler). tree_rate: [tree] rad/s, largest joint rate after the last step. tree_euler_steps: [tree]
+    number of steps still to be taken with phi = 1. fast_out, part_model_out, part_forces_out, factors_out, solve_out:
+    scratch; see :func:`solve_part`. tree_fast_steps_out: [tree] number of steps for which the tree still counts as
+    fast. tree_moved_out: [tree] whether the tree was moved. tree_phi_out: [tree] 1 for a fast tree. joints_out: [body]
+    of a tree that was moved, at the end of the step. bodies_out: motion at the start of the step; of a tree that was
+    moved, at the start of its last part. prediction_out: accelerations over that part, joint rates at the end.
     """
     if wp.tid() >= count[0]:
         return
@@ -237,43 +243,53 @@ def move_fast_trees(
     first = model.tree_first[tree]
     end = first + size * model.pitch
     for k in range(first, end, model.pitch):
-        fast.start_joint_q[k] = joints_out.joint_q[k]
-        fast.start_joint_qd[k] = joints_out.joint_qd[k]
+        fast_out.start_joint_q[k] = joints_out.joint_q[k]
+        fast_out.start_joint_qd[k] = joints_out.joint_qd[k]
     parts = int(1)
     change = float(2.0)
-    while parts <= MAX_PARTS and change > MAX_CHANGE:
+    plain = bool(False)
+    searching = bool(True)
+    while searching:
         for k in range(first, end, model.pitch):
-            fast.coarse_joint_q[k] = joints_out.joint_q[k]
-            fast.coarse_joint_qd[k] = joints_out.joint_qd[k]
-            joints_out.joint_q[k] = fast.start_joint_q[k]
-            joints_out.joint_qd[k] = fast.start_joint_qd[k]
+            fast_out.coarse_joint_q[k] = joints_out.joint_q[k]
+            fast_out.coarse_joint_qd[k] = joints_out.joint_qd[k]
+            joints_out.joint_q[k] = fast_out.start_joint_q[k]
+            joints_out.joint_qd[k] = fast_out.start_joint_qd[k]
         for part in range(parts):
             solve_part(
                 p,
                 parts,
+                plain,
                 p.dt * float(part) / float(parts),
                 model,
                 forces,
                 tree,
-                part_model,
-                part_forces,
+                part_model_out,
+                part_forces_out,
                 joints_out,
                 bodies_out,
                 factors_out,
                 solve_out,
                 prediction_out,
             )
-        if parts > 1:
-            change = relative_change(model, tree, fast, joints_out)
-        parts = 2 * parts
-    if change <= MAX_CHANGE:
-        extrapolate(model, tree, fast, joints_out)
-    if max_joint_rate(joints_out.joint_qd, first, size, model.pitch) <= p.max_rate:
-        for k in range(first, end, model.pitch):
-            prediction_out.joint_qd_free[k] = joints_out.joint_qd[k]
-        tree_moved_out[tree] = True
-    else:  # the integration slows or stops the tree
-        for k in range(first, end, model.pitch):
-            joints_out.joint_q[k] = fast.start_joint_q[k]
-            joints_out.joint_qd[k] = fast.start_joint_qd[k]
+        if plain:
+            searching = False
+        elif not max_joint_rate(joints_out.joint_qd, first, size, model.pitch) <= p.max_rate:
+            plain = True
+            parts = 1
+        else:
+            if parts > 1:
+                change = relative_change(model, tree, fast_out, joints_out)
+            searching = change > MAX_CHANGE and parts < MAX_PARTS
+            parts = 2 * parts
     tree_phi_out[tree] = 1.0
+    if plain:  # the integration of a whole step moves the tree, with the drag
+        for k in range(first, end, model.pitch):
+            joints_out.joint_q[k] = fast_out.start_joint_q[k]
+            joints_out.joint_qd[k] = fast_out.start_joint_qd[k]
+        return
+    if change <= MAX_CHANGE:
+        extrapolate(model, tree, fast_out, joints_out)
+    for k in range(first, end, model.pitch):
+        prediction_out.joint_qd_free[k] = joints_out.joint_qd[k]
+    tree_moved_out[tree] = True
