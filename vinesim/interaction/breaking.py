@@ -20,7 +20,7 @@ from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
-from vinesim.scene.strength import BendingLaw
+from vinesim.scene.strength import BendingLaw, stalk_ends
 
 PULL = "pull"
 BEND = "bend"
@@ -347,20 +347,9 @@ class WoodMonitor:
         return max(shares, key=lambda cause: shares[cause])
 
 
-def stalk_ends(model: Model) -> np.ndarray:
-    """Returns for each bunch the bodies beyond the two joints at which its peduncle ends [bunch, 2]: the first segment
-    of the peduncle, at the shoot, and the bunch. A bunch without a peduncle has its own body twice."""
-    base = model.bunch_body.copy()
-    above = model.body_parent[base]
-    while (is_stalk := (above >= 0) & (model.body_organ[above] == int(Organ.PEDUNCLE))).any():
-        base = np.where(is_stalk, above, base)
-        above = np.where(is_stalk, model.body_parent[above], above)
-    return np.stack([base, model.bunch_body], 1).astype(np.int32)
-
-
 def wood_kinds(model: Model, ends: np.ndarray) -> np.ndarray:
     """Returns for each body what the wood at its joint is [body] int32, as a number of
-    :mod:`vinesim.kernels.plants.wood_stress`. ``ends``: result of :func:`stalk_ends`."""
+    :mod:`vinesim.kernels.plants.wood_stress`. ``ends``: result of :func:`vinesim.scene.strength.stalk_ends`."""
     kind = np.zeros(len(model.body_mass), np.int32)
     kind[(model.body_organ == int(Organ.CANE)) & (model.body_strength > 0.0)] = int(kernels.CANE)
     kind[ends[:, 0]] = int(kernels.STALK_BASE)

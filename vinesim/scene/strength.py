@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from vinesim.core import portable_math
+from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 
 WEAKEST = 0.05
@@ -26,6 +27,8 @@ shoots with fruit)."""
 TANGENT = 0.4
 """[1] Ratio of tangent modulus to Young's modulus between yield and crack. GUESSED from the shape of bending curves of
 green wood, which bend over at two thirds of their strength and reach it at twice the deflection."""
+GRAVITY = 9.81
+"""[m/s^2] Gravity under which plants have grown."""
 LEAST_CHANCE = 1e-3
 """[1] Chances are kept this far from 0 and 1, so that no peduncle has no strength or an endless one."""
 
@@ -117,17 +120,38 @@ class BendingLaw:
         return np.where(over > 0.0, np.minimum(flow + second, self.hardening + self.cracking), flow)
 
 
+def stalk_ends(model: Model) -> np.ndarray:
+    """Returns for each bunch the bodies beyond the two joints at which its peduncle ends [bunch, 2]: the first segment
+    of the peduncle, at the shoot, and the bunch. A bunch without a peduncle has its own body twice."""
+    base = model.bunch_body.copy()
+    above = model.body_parent[base]
+    while (is_stalk := (above >= 0) & (model.body_organ[above] == int(Organ.PEDUNCLE))).any():
+        base = np.where(is_stalk, above, base)
+        above = np.where(is_stalk, model.body_parent[above], above)
+    return np.stack([base, model.bunch_body], 1).astype(np.int32)
+
+
 def with_reserve(model: Model) -> Model:
-    """Raise the strength of canes so that no joint has less than :data:`SAFETY` times its stress at rest. Writes
-    ``body_strength`` and ``body_yield_strength`` of ``model`` and returns it."""
+    """Raise the strength of canes and peduncles so that none has less than :data:`SAFETY` times its stress at rest.
+    Writes ``body_strength``, ``body_yield_strength``, ``bunch_pull`` and ``bunch_bend`` of ``model`` and returns it."""
     wood = np.flatnonzero(model.body_strength > 0.0)
-    settled = model.joint_settled[wood].astype(float)
-    sine = np.sqrt((settled[:, :3] ** 2).sum(1))
-    turn = 2.0 * portable_math.arctan2(sine, np.abs(settled[:, 3])) / np.maximum(sine, 1e-12)
-    moment = model.joint_stiffness[wood] * settled[:, :3] * turn[:, None]
+    moment = _moment_at_rest(model, wood)
     stress = np.sqrt(moment[:, 1] ** 2 + moment[:, 2] ** 2 + 0.75 * moment[:, 0] ** 2)
     stress /= 0.25 * np.pi * model.body_radius[wood, 0].astype(float) ** 3
     raised = np.maximum(SAFETY * stress / model.body_strength[wood], 1.0)
     model.body_strength[wood] *= raised
     model.body_yield_strength[wood] *= raised
+    if len(model.bunch_body):
+        weight = GRAVITY * model.body_mass[model.bunch_body].astype(float)
+        model.bunch_pull[:] = np.maximum(model.bunch_pull, 1.25 * SAFETY * weight)
+        bent = np.linalg.norm(_moment_at_rest(model, stalk_ends(model).ravel()), axis=1).reshape(-1, 2).max(1)
+        model.bunch_bend[:] = np.maximum(model.bunch_bend, bent / (1.0 / SAFETY - weight / model.bunch_pull))
     return model
+
+
+def _moment_at_rest(model: Model, bodies: np.ndarray) -> np.ndarray:
+    """Returns the moments [k, 3] N m in the springs of ``bodies`` [k] in the drawn shape, in joint axes."""
+    settled = model.joint_settled[bodies].astype(float)
+    sine = np.sqrt((settled[:, :3] ** 2).sum(1))
+    turn = 2.0 * portable_math.arctan2(sine, np.abs(settled[:, 3])) / np.maximum(sine, 1e-12)
+    return model.joint_stiffness[bodies] * settled[:, :3] * turn[:, None]
