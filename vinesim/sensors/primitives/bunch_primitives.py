@@ -412,8 +412,9 @@ def _padded_neighbours(neighbours: np.ndarray) -> np.ndarray:
 def _neighbour_occlusion(position: np.ndarray, radius: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
     """Returns the share of light that neighbouring berries hide from each berry, as (v, w) [n, 4].
 
-    At a surface point with unit normal m the hidden share is w + v . m. A neighbour of radius r at distance l hides
-    (1/4 + 0.85 cos) r^2 / l^2, with the cosine between m and the direction to the neighbour.
+    At a surface point with unit normal m the hidden share is w + v . m. A neighbour of radius r whose centre is at
+    distance l from that of a berry of radius R hides (0.07 + 0.55 cos) r^2 / (l - 0.55 R)^2, with the cosine between m
+    and the direction to the neighbour: GUESSED, by eye.
     """
     there = neighbours >= 0
     apart = position[np.maximum(neighbours, 0)] - position[:, None]
@@ -421,4 +422,4 @@ def _neighbour_occlusion(position: np.ndarray, radius: np.ndarray, neighbours: n
     direction = apart / np.maximum(distance, 1e-9)[..., None]
     gap = np.maximum(distance - 0.55 * radius[:, None], 0.3 * radius[:, None])
     weight = np.where(there, np.minimum(radius[np.maximum(neighbours, 0)] ** 2 / gap**2, 1.0), 0.0)
-    return np.concatenate([0.42 * (weight[..., None] * direction).sum(1), 0.07 * weight.sum(1, keepdims=True)], 1)
+    return np.concatenate([0.55 * (weight[..., None] * direction).sum(1), 0.07 * weight.sum(1, keepdims=True)], 1)

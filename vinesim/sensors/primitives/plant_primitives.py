@@ -18,7 +18,7 @@ from vinesim.sensors.raster.primitive_arrays import CONE, LEAF
 
 STEM_TINT = DEFAULT.wood.stem
 """Colour [linear RGB reflectance] of the rachis and the stalks of berries."""
-_YOUNG = 0.15
+_YOUNG = 0.17
 _YOUNGEST = 0.03
 """Ages (:attr:`Model.leaf_age`) between which a leaf's colour changes from young to grown. GUESSED."""
 _TURNED = 0.62
@@ -27,57 +27,138 @@ _UNTURNED = 0.42
 """Age from which leaves show yellow margins."""
 
 
+_NODE_WIDTH = 1.3
+"""Thickness of a node, relative to the cane between nodes: GUESSED, by eye."""
+_LEAST_HUE_SPREAD = 7.0
+"""[deg] Least standard deviation of the hue from leaf to leaf: GUESSED."""
+_RIPE_WOOD = (0.3, 1.1)
+"""Range of the share of a shoot, from its base, up to which it is brown at harvest: GUESSED."""
+_CANE_SPREAD = 0.07
+"""Standard deviation of the reflectance of canes from shoot to shoot, for each colour [1]: GUESSED."""
+_AXILLARY = (0.68, 0.12, 0.11, 0.09)
+"""Shares of the leaves in whose axil 0, 1, 2, ... small leaves of an axillary shoot stand: GUESSED."""
+_AXILLARY_SIZE = (0.30, 0.52)
+"""Range of the length of a small leaf, relative to the leaf in whose axil it stands: GUESSED."""
+_AXILLARY_REACH = (0.03, 0.08)
+"""[m] Range of the distance of small leaves from the node: GUESSED."""
 _MOST_BENT = np.array([0.5, 0.7, 0.7])
 """Largest curvatures of a leaf: across and along the midrib, and fold at the midrib [leaf units]: GUESSED."""
 
 
-def cane_batch(model: Model) -> Batch:
-    """Returns the primitives of canes and peduncles: one round cone for each segment."""
+def cane_batches(model: Model) -> list[Batch]:
+    """Returns the primitives of canes and peduncles, one round cone for each segment, and of the nodes of those
+    segments of canes that carry no leaf."""
     bodies = np.flatnonzero((model.body_organ != int(Organ.BUNCH)) & (model.body_length > 0.0))
-    rng = np.random.default_rng(5)
-    seed = rng.uniform(size=len(model.tree_first))
+    seed = np.random.default_rng(5).uniform(size=len(model.tree_first))
     organ = model.body_organ[bodies]
     tree = model.body_tree[bodies]
-    index = tree.copy()
     bunch_of = model.bunch_of_body()[bodies]
-    index = np.where(bunch_of >= 0, bunch_of, index)
-    # shoots become brown from the base: they are green towards the tip, brown where the wood is thick
-    green = np.clip(1.6 - model.body_radius[bodies].mean(1) / 0.0022, 0.0, 1.0) * (seed[tree] < 0.6)
-    green = np.where(organ == int(Organ.PEDUNCLE), 1.0, green)[:, None]
-    wood = model.look.palette.wood
-    tint = (1.0 - green) * np.array(wood.cane) * (0.7 + 0.6 * seed[tree, None]) + green * np.array(wood.stem)
-    material = np.where(green[:, 0] > 0.5, int(materials.STEM), int(materials.CANE))
+    index = np.where(bunch_of >= 0, bunch_of, tree)
+    is_stalk = organ == int(Organ.PEDUNCLE)
+    reach = _reach(model)
     length = model.body_length[bodies]
     zero = np.zeros(len(bodies))
-    return make_batch(
+    canes = make_batch(
         CONE,
         stack_columns(zero, zero, zero, model.body_radius[bodies, 0]),
         b=stack_columns(length, zero, zero, model.body_radius[bodies, 1]),
-        c=stack_columns(zero, seed[tree] * 7.0, zero, zero),
-        material=material,
-        tint=tint,
+        c=stack_columns(np.where(is_stalk, 0.0, reach[bodies]), seed[tree] * 7.0, zero, zero),
+        material=np.where(is_stalk, int(materials.STEM), int(materials.CANE)),
+        tint=_cane_tints(model, reach)[bodies],
         organ=organ,
         label=organ * label(Organ(1), 0) + index,
         carrier=bodies,
         group=tree,
     )
+    bare = np.setdiff1d(bodies[~is_stalk], model.leaf_body)
+    return [canes, *_nodes(model, bare, np.zeros(len(bare)), _cane_tints(model, reach), buds=True)]
 
 
-def _leaf_tints(colours: LeafColours, age: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Returns the reflectance [leaf, 3] of the upper sides of leaves of ``age`` [leaf], linear RGB."""
+def _reach(model: Model) -> np.ndarray:
+    """Returns the distance [body] m along the wood from the base of the tree to the start of each body."""
+    reach = np.zeros(len(model.body_mass))
+    depth = model.depth()
+    for level in range(1, int(depth.max(initial=0)) + 1):
+        here = np.flatnonzero(depth == level)
+        above = model.body_parent[here]
+        reach[here] = reach[above] + model.body_length[above]
+    return reach
+
+
+def _cane_tints(model: Model, reach: np.ndarray) -> np.ndarray:
+    """Returns the colour [body, 3] of canes and peduncles: shoots ripen from their base, so they are brown below and
+    green above, each up to another height. ``reach``: [body] m, see :func:`_reach`."""
+    wood = model.look.palette.wood
+    rng = np.random.default_rng(5)
+    tree = model.body_tree
+    seed = rng.uniform(size=len(model.tree_first))[tree]
+    ripe = rng.uniform(*_RIPE_WOOD, len(model.tree_first))[tree]
+    hue = rng.normal(0.0, _CANE_SPREAD, (len(model.tree_first), 3))[tree]
+    longest = np.zeros(len(model.tree_first))
+    np.maximum.at(longest, tree, reach)
+    share = reach / np.maximum(longest, 1e-6)[tree]
+    green = textures.smoothstep(ripe - 0.2, ripe + 0.2, share + 0.08 * rng.normal(size=len(tree)))
+    green = np.where(model.body_organ == int(Organ.PEDUNCLE), 1.0, green)[:, None]
+    brown = np.array(wood.cane) * (0.7 + 0.6 * seed[:, None]) * (1.0 + np.clip(hue, -0.4, 0.4))
+    return (1.0 - green) * brown + green * np.array(wood.stem) * (1.0 + 0.5 * np.clip(hue, -0.4, 0.4))
+
+
+def _nodes(model: Model, body: np.ndarray, along: np.ndarray, tints: np.ndarray, *, buds: bool) -> list[Batch]:
+    """Returns the primitives of nodes of canes: swellings, and buds on alternating sides of them.
+
+    ``body``: [node] body of each node; ``along``: [node] m, distance from the start of the body; ``tints``: [body, 3]
+    colours of canes.
+    """
+    if not len(body):
+        return []
+    share = np.clip(along / np.maximum(model.body_length[body], 1e-6), 0.0, 1.0)
+    r = model.body_radius[body, 0] * (1.0 - share) + model.body_radius[body, 1] * share
+    axis = along[:, None] * np.array([1.0, 0.0, 0.0])
+    reach = np.array([1.0, 0.0, 0.0]) * r[:, None]
+    tree = model.body_tree[body]
+    common = {
+        "material": int(materials.CANE),
+        "organ": int(Organ.CANE),
+        "label": label(Organ.CANE, 0) + tree,
+        "carrier": body,
+        "group": tree,
+    }
+    ratio = np.array(model.look.palette.wood.node) / np.array(model.look.palette.wood.cane)
+    tint = tints[body] * ratio
+    swelling = make_batch(
+        CONE,
+        stack_columns(axis - 1.6 * reach, 1.02 * r),
+        b=stack_columns(axis + 0.1 * reach, _NODE_WIDTH * r),
+        tint=tint,
+        **common,
+    )
+    if not buds:
+        return [swelling]
+    side = np.where(body % 2, 1.0, -1.0)[:, None] * np.array([0.0, 1.0, 0.0])
+    bud = make_batch(
+        CONE,
+        stack_columns(axis + side * (0.9 * r)[:, None], 0.0034),
+        b=stack_columns(axis + side * (r + 0.0045)[:, None] + 0.006 * np.array([1.0, 0.0, 0.0]), 0.0016),
+        tint=0.75 * tint,
+        **common,
+    )
+    return [swelling, bud]
+
+
+def _leaf_tints(colours: LeafColours, age: np.ndarray, tree: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Returns the reflectance [leaf, 3] of the upper sides of leaves of ``age`` [leaf] on shoots ``tree`` [leaf],
+    linear RGB."""
     count = len(age)
     youth = np.clip((_YOUNG - age[:, None]) / (_YOUNG - _YOUNGEST), 0.0, 1.0)
     grown = np.array(colours.grown)
     base = grown + youth * (np.array(colours.young) - grown)
-    tint = (
-        base * (0.75 + 0.6 * rng.uniform(size=(count, 1))) * (1.0 + colours.value_spread * rng.normal(size=(count, 1)))
-    )
+    shoot = np.random.default_rng(19).normal(size=int(tree.max(initial=0)) + 1)[tree, None]
+    spread = 1.0 + colours.value_spread * np.clip(rng.normal(size=(count, 1)) + 0.8 * shoot, -2.5, 2.5)
+    tint = base * (0.62 + 0.8 * rng.uniform(size=(count, 1))) * spread
     tint = tint + np.array(colours.pale) * np.clip(0.7 * rng.normal(size=(count, 1)), 0.0, 2.0)
-    if colours.hue_spread > 0.0:
-        # a generator of its own: the shapes of leaves do not depend on the palette
-        turn = colours.hue_spread * np.random.default_rng(41).normal(size=count)
-        tint = _turn_hue(np.clip(tint, 0.0, 1.0), turn)
-    return tint
+    # a generator of its own: the shapes of leaves do not depend on the palette
+    turn = max(colours.hue_spread, _LEAST_HUE_SPREAD) * np.random.default_rng(41).normal(size=count)
+    return _turn_hue(np.clip(tint, 0.0, 1.0), turn)
 
 
 def _turn_hue(linear: np.ndarray, turn: np.ndarray) -> np.ndarray:
@@ -97,64 +178,74 @@ def shown_age(colours: LeafColours, age: np.ndarray) -> np.ndarray:
 
 def leaf_batches(model: Model) -> list[Batch]:
     """Returns the primitives of leaf blades, their petioles, and the cane nodes from which they grow."""
-    count = len(model.leaf_body)
-    if not count:
+    if not len(model.leaf_body):
         return []
     rng = np.random.default_rng(11)
-    variety = model.variety_of_trees()[model.body_tree[model.leaf_body]]
+    leaf, size, petiole_end, rib, up = _blades(model)
+    count = len(leaf)
+    body = model.leaf_body[leaf]
+    tree = model.body_tree[body]
+    variety = model.variety_of_trees()[tree]
     shape = leaves.blade_shape(np.arange(count), np.array([*(v.sinus_depth or 0.0 for v in VARIETIES), 0.0])[variety])
-    q = model.leaf_pose[:, 3:]
-    rib, up = (frames.rotate(q, np.broadcast_to(np.eye(3)[k], (count, 3))) for k in (0, 2))
-    base = model.leaf_base
-    petiole_end = model.leaf_pose[:, :3]
-    size = model.leaf_size * textures.leaf_scale(shape)
     colours = model.look.palette.leaf
-    tint = _leaf_tints(colours, model.leaf_age, rng)
-    bend = np.stack([rng.normal(-0.10, 0.16, count), rng.normal(-0.16, 0.14, count), rng.uniform(0.0, 0.45, count)], 1)
+    small = np.arange(count) >= len(model.leaf_body)
+    age = np.where(small, 0.9 * model.leaf_age[leaf], model.leaf_age[leaf])
+    tint = _leaf_tints(colours, age, tree, rng)
+    bend = np.stack([rng.normal(-0.12, 0.22, count), rng.normal(-0.18, 0.20, count), rng.uniform(-0.1, 0.5, count)], 1)
     bend = np.clip(
         bend * (1.0 + rng.exponential(0.35, (count, 1))), -_MOST_BENT, _MOST_BENT
     )  # some leaves curl or fold
-    body = model.leaf_body
-    tree = model.body_tree[model.leaf_body]
-    names = label(Organ.LEAF, 0) + tree
+    common = {"organ": int(Organ.LEAF), "label": label(Organ.LEAF, 0) + tree, "carrier": body, "group": tree}
     blade = make_batch(
         LEAF,
-        stack_columns(petiole_end, size),
+        stack_columns(petiole_end, size * textures.leaf_scale(shape)),
         b=stack_columns(rib, shape),
         c=stack_columns(up, rng.uniform(size=count)),
-        d=stack_columns(bend, shown_age(colours, model.leaf_age)),
+        d=stack_columns(bend, shown_age(colours, age)),
         material=int(materials.FOLIAGE),
         tint=tint,
-        organ=int(Organ.LEAF),
-        label=names,
-        carrier=body,
-        group=tree,
+        **common,
     )
     petiole = make_batch(
         CONE,
-        stack_columns(base, 0.0017),
-        b=stack_columns(petiole_end, 0.0012),
+        stack_columns(model.leaf_base[leaf], np.where(small, 0.0012, 0.0017)),
+        b=stack_columns(petiole_end, np.where(small, 0.0009, 0.0012)),
         material=int(materials.STEM),
-        tint=colours.petiole,
-        organ=int(Organ.LEAF),
-        label=names,
-        carrier=body,
-        group=tree,
+        tint=np.array(colours.petiole) * rng.uniform(0.6, 1.4, (count, 1)),
+        **common,
     )
-    # a node is 1.45 times as thick as the cane between nodes
-    along = np.clip(base[:, 0] / np.maximum(model.body_length[body], 1e-6), 0.0, 1.0)
-    r = model.body_radius[body, 0] * (1.0 - along) + model.body_radius[body, 1] * along
-    reach = np.array([1.0, 0.0, 0.0]) * r[:, None]
-    axis = base * np.array([1.0, 0.0, 0.0])
-    node = make_batch(
-        CONE,
-        stack_columns(axis - 0.7 * reach, 1.25 * r),
-        b=stack_columns(axis + 0.4 * reach, 1.45 * r),
-        material=int(materials.CANE),
-        tint=model.look.palette.wood.node,
-        organ=int(Organ.CANE),
-        label=label(Organ.CANE, 0) + tree,
-        carrier=body,
-        group=tree,
+    tints = _cane_tints(model, _reach(model))
+    return [blade, petiole, *_nodes(model, model.leaf_body, model.leaf_base[:, 0], tints, buds=False)]
+
+
+def _blades(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the blades: number of the model's leaf [blade], size [blade] m in the unit of ``Model.leaf_size``, end of
+    the petiole [blade, 3] m, midrib and upper normal [blade, 3].
+
+    The first blades are those of the model. After them come the small leaves of axillary shoots, which stand in the
+    axils of some leaves. The area of a leaf in the model, by which it weighs and catches wind, is shared among its
+    blade and the small ones.
+    """
+    rng = np.random.default_rng(13)
+    count = len(model.leaf_body)
+    size = np.array(model.leaf_size, float)
+    q = model.leaf_pose[:, 3:]
+    rib, up = (frames.rotate(q, np.broadcast_to(np.eye(3)[k], (count, 3))) for k in (0, 2))
+    many = rng.choice(len(_AXILLARY), count, p=_AXILLARY) * (size > 0.6 * np.median(size))
+    leaf = np.repeat(np.arange(count), many)
+    ratio = rng.uniform(*_AXILLARY_SIZE, len(leaf))
+    given = np.bincount(leaf, ratio**2, count)
+    axis = np.array([1.0, 0.0, 0.0])
+    stalk = frames.normalize(model.leaf_pose[:, :3] - model.leaf_base)[leaf]
+    way = frames.normalize(0.6 * stalk + 0.7 * axis + 0.5 * rng.normal(size=(len(leaf), 3)))
+    end = model.leaf_base[leaf] + way * rng.uniform(*_AXILLARY_REACH, (len(leaf), 1))
+    small_rib = frames.normalize(rib[leaf] + 0.6 * rng.normal(size=(len(leaf), 3)))
+    small_up = up[leaf] + 0.5 * rng.normal(size=(len(leaf), 3))
+    small_up = frames.normalize(small_up - small_rib * (small_up * small_rib).sum(1, keepdims=True))
+    return (
+        np.append(np.arange(count), leaf),
+        np.append(size * np.sqrt(1.0 - given), size[leaf] * ratio),
+        np.concatenate([model.leaf_pose[:, :3], end]),
+        np.concatenate([rib, small_rib]),
+        np.concatenate([up, small_up]),
     )
-    return [blade, petiole, node]
