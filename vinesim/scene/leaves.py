@@ -215,9 +215,8 @@ def grow_leaves(
 
     # blades face the light: flat above the net in a tendone, hanging and facing outwards in a hedge
     flat = frames.normalize(out * [1.0, 1.0, 0.0])
-    loose = 0.45 if tendone else 0.6
-    midrib = frames.normalize(flat + loose * swing * axis + ((-0.45 if tendone else -1.0) + loose * droop) * up)
-    upper = up + (0.0 if tendone else 0.9) * flat + loose * np.concatenate(lean, -1)
+    midrib = frames.normalize(flat + 0.3 * swing * axis + ((-0.45 if tendone else -1.0) + 0.3 * droop) * up)
+    upper = up + (0.0 if tendone else 0.9) * flat + 0.3 * np.concatenate(lean, -1)
     pose = np.concatenate([blade, frames.multiply(frames.conjugate(turn), frames.from_x_axis(midrib, upper))], -1)
     age = np.where(turned < scene.season.yellow, 0.75, 0.05 + 0.45 * (1.0 - share)) + 0.08 * ageing[..., 0]
     mass = leaf.mass_per_area.value * area + leaf.petiole_mass.value * np.sqrt(shrink)

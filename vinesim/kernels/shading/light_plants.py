@@ -31,6 +31,7 @@ from vinesim.kernels.shading.materials import (
     bloom_cover,
     bloom_share,
     dry_cover,
+    leaf_sheen,
     mix,
     row_greenness,
     smoothstep,
@@ -190,9 +191,9 @@ def blade_light(
     above = (1.0 - under) * (1.0 - grass)
     felt = mix(albedo * 1.05, colours.under, 0.42)
     albedo = mix(mix(albedo, felt, below), colours.under_vein, below * vein * 0.7)
-    albedo = mix(albedo, colours.vein, above * vein * 0.75)
+    albedo = mix(albedo, colours.vein, above * vein * 0.65)
     gloss = trait(seed, 17.31)
-    specular = 0.012 + (0.020 + 0.028 * gloss) * above
+    specular = 0.012 + (0.023 + 0.03 * gloss) * above
     shininess = 12.0 - 6.0 * below + (26.0 * gloss * gloss - 3.0) * above
     occlusion = wp.where(grass > 0.5, 0.35 + 0.65 * smoothstep(-0.75, 0.0, v), 1.0)
     sky = materials.sky[i]
@@ -217,7 +218,7 @@ def blade_light(
     surroundings = mix(
         light.ground_colour, mix(light.canopy_colour * 0.45, light.sky_colour, sky * sky), 0.5 + 0.5 * mirrored
     )
-    colour += surroundings * (wp.min(fresnel, 0.16) * (0.45 + 0.95 * gloss) * above * occlusion)
+    colour += surroundings * (wp.min(fresnel, 0.16) * leaf_sheen(gloss) * above * occlusion)
     return haze(light, colour, z * scale)
 
 

@@ -268,6 +268,13 @@ def trait(seed: float, factor: float) -> float:
 
 
 @wp.func
+def leaf_sheen(gloss: float) -> float:
+    """Returns how well a leaf mirrors its surroundings, from its ``gloss``, 0 to 1: GUESSED, by the blue of photographed
+    leaves below the sky."""
+    return 0.7 + 1.5 * gloss
+
+
+@wp.func
 def blade_colour(tint: wp.vec3, tone: float, wide: float, middle: float, hue: float) -> wp.vec3:
     """Returns the albedo of a green blade at a point, from the leaf's mean ``tint`` and the ``tone`` of its texture.
 
@@ -454,8 +461,8 @@ def leaf_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, d: wp.vec3
             s.specular = 0.012
             s.shininess = 6.0
         else:
-            s.albedo = mix(s.albedo, materials.colours.vein, vein * 0.75)
-            s.specular = 0.032 + 0.028 * gloss
+            s.albedo = mix(s.albedo, materials.colours.vein, vein * 0.65)
+            s.specular = 0.035 + 0.03 * gloss
             s.shininess = 9.0 + 26.0 * gloss * gloss
-            s.reflectivity = 0.45 + 0.95 * gloss
+            s.reflectivity = leaf_sheen(gloss)
     return s

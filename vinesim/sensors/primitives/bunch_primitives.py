@@ -36,6 +36,9 @@ _BUNCH_SPREAD = np.array([0.08, 0.04, 0.10])
 _CROWDED = 0.21
 """Mean share of light hidden by neighbours from which on the pedicel of a berry of a wine grape is not drawn: berries
 cover it. GUESSED."""
+_BULGE = 0.05
+"""How much a berry of a wine grape that others press on all sides bulges between them, relative to its radius: GUESSED.
+"""
 _SHOT_BERRY_SHARE = 0.06
 """Share of the berries of a completely unripe bunch that have stayed small and green ("shot berries"). GUESSED."""
 
@@ -251,20 +254,23 @@ class _Berries:
         edge = np.array([_quantile_80(a) for a in np.split(away, np.cumsum(count)[:-1])])[bunch]
         first_berry = (np.cumsum(count) - count)[bunch][:, None]
         near = np.concatenate([_padded_neighbours(one.neighbours) for one in layouts])
+        is_wine = np.array([v.style != "table" for v in varieties])[bunch]
+        occlusion = _neighbour_occlusion(position, radius, np.where(near >= 0, near + first_berry, -1))
+        pressed = is_wine * np.clip(occlusion[:, 3] / _CROWDED, 0.0, 1.0)
         return cls(
             bunch=bunch,
             segment=bunches.segment_at(position, bunch),
             position=position,
-            radius=radius,
+            radius=radius * (1.0 + _BULGE * pressed),
             axis=axis,
             foot=foot,
             elongation=np.array([v.elongation for v in varieties])[bunch],
             colour=colour,
             seed=seed,
             depth=np.clip(0.35 + 0.65 * away / np.maximum(edge, 1e-6), 0.0, 1.0),
-            occlusion=_neighbour_occlusion(position, radius, np.where(near >= 0, near + first_berry, -1)),
+            occlusion=occlusion,
             damage=np.stack([rot, dry - burnt], 1),
-            is_wine=np.array([v.style != "table" for v in varieties])[bunch],
+            is_wine=is_wine,
         )
 
     def fruit(self, bunches: _Bunches) -> Batch:

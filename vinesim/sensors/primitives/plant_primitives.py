@@ -27,15 +27,21 @@ _UNTURNED = 0.42
 """Age from which leaves show yellow margins."""
 
 
+_WAX = 0.9
+"""Turn of the hue of waxy leaves towards blue, relative to the spread of hues: GUESSED by the share of blue green in
+photographs."""
 _NODE_WIDTH = 1.3
 """Thickness of a node, relative to the cane between nodes: GUESSED, by eye."""
-_LEAST_HUE_SPREAD = 7.0
+_LEAST_HUE_SPREAD = 9.0
 """[deg] Least standard deviation of the hue from leaf to leaf: GUESSED."""
 _RIPE_WOOD = (0.3, 1.1)
 """Range of the share of a shoot, from its base, up to which it is brown at harvest: GUESSED."""
 _CANE_SPREAD = 0.07
 """Standard deviation of the reflectance of canes from shoot to shoot, for each colour [1]: GUESSED."""
-_AXILLARY = (0.68, 0.12, 0.11, 0.09)
+_LOOSE = 0.4
+"""[rad] Angle by which blades are turned at random from the poses in the model, in which they face the light alike:
+GUESSED, by eye."""
+_AXILLARY = (0.74, 0.11, 0.09, 0.06)
 """Shares of the leaves in whose axil 0, 1, 2, ... small leaves of an axillary shoot stand: GUESSED."""
 _AXILLARY_SIZE = (0.30, 0.52)
 """Range of the length of a small leaf, relative to the leaf in whose axil it stands: GUESSED."""
@@ -97,7 +103,7 @@ def _cane_tints(model: Model, reach: np.ndarray) -> np.ndarray:
     longest = np.zeros(len(model.tree_first))
     np.maximum.at(longest, tree, reach)
     share = reach / np.maximum(longest, 1e-6)[tree]
-    green = textures.smoothstep(ripe - 0.2, ripe + 0.2, share + 0.08 * rng.normal(size=len(tree)))
+    green = textures.smoothstep(-0.2, 0.2, share - ripe + 0.08 * rng.normal(size=len(tree)))
     green = np.where(model.body_organ == int(Organ.PEDUNCLE), 1.0, green)[:, None]
     brown = np.array(wood.cane) * (0.7 + 0.6 * seed[:, None]) * (1.0 + np.clip(hue, -0.4, 0.4))
     return (1.0 - green) * brown + green * np.array(wood.stem) * (1.0 + 0.5 * np.clip(hue, -0.4, 0.4))
@@ -157,7 +163,9 @@ def _leaf_tints(colours: LeafColours, age: np.ndarray, tree: np.ndarray, rng: np
     tint = base * (0.62 + 0.8 * rng.uniform(size=(count, 1))) * spread
     tint = tint + np.array(colours.pale) * np.clip(0.7 * rng.normal(size=(count, 1)), 0.0, 2.0)
     # a generator of its own: the shapes of leaves do not depend on the palette
-    turn = max(colours.hue_spread, _LEAST_HUE_SPREAD) * np.random.default_rng(41).normal(size=count)
+    plain, waxy = np.random.default_rng(41).normal(size=(2, count))
+    # wax makes some leaves bluer
+    turn = max(colours.hue_spread, _LEAST_HUE_SPREAD) * (plain + _WAX * np.clip(waxy, 0.0, 2.0))
     return _turn_hue(np.clip(tint, 0.0, 1.0), turn)
 
 
@@ -231,6 +239,7 @@ def _blades(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarra
     size = np.array(model.leaf_size, float)
     q = model.leaf_pose[:, 3:]
     rib, up = (frames.rotate(q, np.broadcast_to(np.eye(3)[k], (count, 3))) for k in (0, 2))
+    rib, up = _turned(rib, up, _LOOSE, rng)
     many = rng.choice(len(_AXILLARY), count, p=_AXILLARY) * (size > 0.6 * np.median(size))
     leaf = np.repeat(np.arange(count), many)
     ratio = rng.uniform(*_AXILLARY_SIZE, len(leaf))
@@ -239,9 +248,7 @@ def _blades(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarra
     stalk = frames.normalize(model.leaf_pose[:, :3] - model.leaf_base)[leaf]
     way = frames.normalize(0.6 * stalk + 0.7 * axis + 0.5 * rng.normal(size=(len(leaf), 3)))
     end = model.leaf_base[leaf] + way * rng.uniform(*_AXILLARY_REACH, (len(leaf), 1))
-    small_rib = frames.normalize(rib[leaf] + 0.6 * rng.normal(size=(len(leaf), 3)))
-    small_up = up[leaf] + 0.5 * rng.normal(size=(len(leaf), 3))
-    small_up = frames.normalize(small_up - small_rib * (small_up * small_rib).sum(1, keepdims=True))
+    small_rib, small_up = _turned(rib[leaf], up[leaf], _LOOSE, rng)
     return (
         np.append(np.arange(count), leaf),
         np.append(size * np.sqrt(1.0 - given), size[leaf] * ratio),
@@ -249,3 +256,10 @@ def _blades(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarra
         np.concatenate([rib, small_rib]),
         np.concatenate([up, small_up]),
     )
+
+
+def _turned(rib: np.ndarray, up: np.ndarray, angle: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Returns midribs and upper normals [n, 3] turned at random, by about ``angle`` rad."""
+    rib = frames.normalize(rib + angle * rng.normal(size=rib.shape))
+    up = up + angle * rng.normal(size=up.shape)
+    return rib, frames.normalize(up - rib * (up * rib).sum(1, keepdims=True))

@@ -171,7 +171,7 @@ def _leaf_texture() -> disk_cache.Arrays:
             turn = np.radians(angle)
             tip = length * np.array([np.sin(turn), np.cos(turn)])
             away, along = _segment(u, v, np.zeros(2), tip)
-            vein = np.maximum(vein, np.exp(-((away / (0.021 * (1.0 - 0.65 * along))) ** 2)))
+            vein = np.maximum(vein, np.exp(-((away / (0.018 * (1.0 - 0.65 * along))) ** 2)))
             away_from_vein = np.minimum(away_from_vein, away)
             for start in np.linspace(0.14, 0.88, 6) + rng.normal(0.0, 0.015, 6):
                 for side in (1.0, -1.0):
@@ -181,7 +181,7 @@ def _leaf_texture() -> disk_cache.Arrays:
                     reach = 0.5 * length * (1.0 - 0.7 * abs(start - 0.35))
                     knee = root + 0.5 * reach * np.array([np.sin(out), np.cos(out)])
                     end = knee + 0.5 * reach * np.array([np.sin(bent), np.cos(bent)])
-                    for first, last, wide in ((root, knee, 0.011), (knee, end, 0.008)):
+                    for first, last, wide in ((root, knee, 0.010), (knee, end, 0.007)):
                         away, along = _segment(u, v, first, last)
                         vein = np.maximum(vein, 0.62 * np.exp(-((away / (wide * (1.0 - 0.3 * along))) ** 2)))
                         away_from_vein = np.minimum(away_from_vein, away)
@@ -191,7 +191,7 @@ def _leaf_texture() -> disk_cache.Arrays:
         puffed = 1.0 - np.exp(-((away_from_vein / 0.06) ** 2))  # the blade rises between its veins
         height = 0.014 * puffed + 0.008 * wide + 0.0016 * fine
         slope_v, slope_u = np.gradient(height, 2.0 / TEXTURE_SIZE)
-        tone = 0.45 + 0.12 * wide + 0.08 * fine + 0.22 * np.exp(-((away_from_vein / 0.03) ** 2))
+        tone = 0.47 + 0.12 * wide + 0.08 * fine + 0.15 * np.exp(-((away_from_vein / 0.024) ** 2))
         for spot_u, spot_v, size in rng.uniform((-0.7, -0.4, 0.008), (0.7, 0.8, 0.03), (6 * (shape % 4 > 1), 3)):
             tone -= 1.3 * np.exp(-((np.hypot(u - spot_u, v - spot_v) / size) ** 4))  # spots of blight
         table[shape] = np.stack([np.maximum(vein, 0.16 * net), slope_u, slope_v, tone], -1)
