@@ -177,8 +177,8 @@ def blade_light(
     bumpy = side * slope_u + rib * slope_v + up
     n = unit(mix(bumpy, plain * 0.5 + wp.vec3(0.0, 0.0, 0.8), grass))
     tint = row3(tables.tint, i)
-    albedo = blade_colour(tint, sampled(tables.leaf_texture, t, 3), wide, middle, hue)
-    albedo = mix(tint * wp.where(grass > 0.5, 0.35 + 0.75 * (0.5 + 0.5 * v), 1.0), albedo, near)
+    tone = 0.5 + near * (sampled(tables.leaf_texture, t, 3) - 0.5)
+    albedo = mix(blade_colour(tint, tone, wide, middle, hue), tint * (0.35 + 0.75 * (0.5 + 0.5 * v)), grass)
     colours = materials.colours
     age = wp.max(tables.d[i, 3] - 0.42, 0.0) * 1.7 * (1.0 - grass)
     turned = turned_colour(colours, albedo, age, edge_distance(tables, i, u, v), vein, hue, wide, middle)
@@ -386,7 +386,7 @@ def berry_light(
     wide1 = sampled(tables.noise, t, 1)
     t = texels_around(w[0] * 1.1 + w[2] * 0.6 + seed, w[1] * 1.1 - w[2] * 0.4)
     fine = sampled(tables.noise, t, 1)
-    albedo = tint * (0.82 + 0.44 * wide1)
+    albedo = tint * (0.86 + 0.52 * wide1)
     amber = pale * 0.35 * wp.clamp(8.0 * (tint[0] / tint[1] - 0.8), 0.0, 1.0)
     albedo = mix(albedo, wp.vec3(0.46, 0.30, 0.06), amber * smoothstep(0.5, 0.8, wide0 + 0.15 * n[2]))
     fine2 = sampled(tables.noise, t, 2)
@@ -405,7 +405,7 @@ def berry_light(
     albedo = mix(albedo, bloom_colour(pale), wp.clamp(dusty, 0.0, 0.8))
     albedo = mix(albedo, wp.vec3(0.33, 0.30, 0.25), rot * 0.75 * fuzz)
     shininess = (70.0 - 72.0 * wp.min(dusty, 0.75)) * (1.0 - 0.8 * rot)
-    reflectivity = 0.85 * (1.0 - wp.min(dusty * 1.6, 0.85)) * (1.0 - rot)
+    reflectivity = 1.1 * (1.0 - wp.min(dusty * 1.6, 0.85)) * (1.0 - rot)
     plain = n
     n = unit(n + wp.vec3(fine - 0.5, fine2 - 0.5, fine3 - 0.5) * ((1.6 * dry + 0.8 * rot) * near))
     # light
@@ -423,7 +423,7 @@ def berry_light(
     colour += wp.cw_mul(transmission, light.sun_colour * sunny + ambient_light(light, -n, sky) * (0.35 * occlusion))
     grazing = 1.0 - wp.max(-wp.dot(n, d), 0.0)
     g2 = grazing * grazing
-    fresnel = 0.045 + 0.955 * g2 * g2 * grazing * 0.504
+    fresnel = 0.06 + 0.94 * g2 * g2 * grazing * 0.672
     peak = 1.0 - wp.max(wp.dot(n, unit(light.sun - d)), 0.0)
     bright = falling_exp(shininess * peak) * (shininess * 0.14 + 0.4) * wp.max(ndl + 0.05, 0.0)
     colour += light.sun_colour * (fresnel * lit * bright)

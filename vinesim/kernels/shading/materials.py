@@ -281,7 +281,7 @@ def blade_colour(tint: wp.vec3, tone: float, wide: float, middle: float, hue: fl
     ``wide``, ``middle`` and ``hue`` are noise around 0.5: brightness in large and in small patches, and yellowness.
     """
     warm = wp.clamp(hue - 0.58, -0.4, 0.4)
-    bright = (0.58 + 0.64 * tone) * (0.66 + 0.50 * wide + 0.18 * middle)
+    bright = (0.62 + 0.68 * tone) * (0.66 + 0.50 * wide + 0.18 * middle)
     return wp.cw_mul(tint, wp.vec3(1.0 + 0.8 * warm, 1.0 + 0.35 * warm, 1.0 - 0.1 * warm)) * bright
 
 
@@ -332,7 +332,7 @@ def berry_occlusion(hidden: float, pale: float, depth: float) -> float:
 
     Light comes through ``pale`` neighbours; ``depth``: relative distance from the bunch's axis, 0 to 1.
     """
-    return wp.clamp(1.0 - hidden, 0.05 + 0.08 * pale, 1.0) * (0.28 + 0.72 * depth)
+    return wp.clamp(1.0 - hidden, 0.04 + 0.05 * pale, 1.0) * (0.15 + 0.85 * depth * depth)
 
 
 @wp.func
@@ -358,7 +358,7 @@ def berry_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: fl
     s.transmission = tint * (1.8 * (1.0 - rot)) * pale
     s.transmission += wp.vec3(0.26, 0.03, 0.012) * red + wp.vec3(0.03, 0.003, 0.004)
     bloom = bloom_cover(c4[0], pale, red)
-    s.specular = 0.045
+    s.specular = 0.06
     bm = bloom * 0.45
     fuzz = float(0.4)
     if pixel < a4[3] * 0.35:
@@ -368,7 +368,7 @@ def berry_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: fl
             materials.noise_texture, w[0] * 0.20 + seed * 7.1, w[1] * 0.20 + w[2] * 0.31 + seed * 3.3
         )
         fine = sample_bilinear(materials.noise_texture, w[0] * 1.1 + w[2] * 0.6 + seed, w[1] * 1.1 - w[2] * 0.4)
-        s.albedo = tint * (0.82 + 0.44 * wide[1])
+        s.albedo = tint * (0.86 + 0.52 * wide[1])
         amber = pale * 0.35 * wp.clamp(8.0 * (tint[0] / tint[1] - 0.8), 0.0, 1.0)
         s.albedo = mix(s.albedo, wp.vec3(0.46, 0.30, 0.06), amber * smoothstep(0.5, 0.8, wide[0] + 0.15 * n[2]))
         s.albedo = s.albedo * (1.0 + pale * (0.14 * fine[2] - 0.07) + red * wp.where(fine[3] > 0.82, 0.22, 0.0))
@@ -386,7 +386,7 @@ def berry_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: fl
     s.albedo = mix(s.albedo, bloom_colour(pale), wp.clamp(bm, 0.0, 0.8))
     s.albedo = mix(s.albedo, wp.vec3(0.33, 0.30, 0.25), rot * 0.75 * fuzz)
     s.shininess = (70.0 - 72.0 * wp.min(bm, 0.75)) * (1.0 - 0.8 * rot)
-    s.reflectivity = 0.85 * (1.0 - wp.min(bm * 1.6, 0.85)) * (1.0 - rot)
+    s.reflectivity = 1.1 * (1.0 - wp.min(bm * 1.6, 0.85)) * (1.0 - rot)
     return s
 
 
@@ -416,6 +416,7 @@ def leaf_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, d: wp.vec3
         s.occlusion = 0.35 + 0.65 * smoothstep(-0.75, 0.0, v)
     else:
         vein = float(0.0)
+        tone = float(0.5)
         age = wp.max(bend[3] - 0.42, 0.0) * 1.7  # leaves younger than 0.42 keep their colour
         gloss = trait(c4[3], 17.31)
         near = size > pixel * 10.0
@@ -443,7 +444,8 @@ def leaf_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, d: wp.vec3
                 + rib * (slope_v - t[2] * clear + (spot[2] - 0.5) * wave)
                 + up
             )
-            s.albedo = blade_colour(s.albedo, t[3], spot[1], spot[2], spot[0])
+            tone = t[3]
+        s.albedo = blade_colour(s.albedo, tone, spot[1], spot[2], spot[0])
         if age > 0.02:
             edge = (
                 float(
