@@ -405,7 +405,7 @@ def berry_light(
     albedo = mix(albedo, bloom_colour(pale), wp.clamp(dusty, 0.0, 0.8))
     albedo = mix(albedo, wp.vec3(0.33, 0.30, 0.25), rot * 0.75 * fuzz)
     shininess = (70.0 - 72.0 * wp.min(dusty, 0.75)) * (1.0 - 0.8 * rot)
-    reflectivity = 1.1 * (1.0 - wp.min(dusty * 1.6, 0.85)) * (1.0 - rot)
+    reflectivity = 0.75 * (1.0 - wp.min(dusty * 1.6, 0.85)) * (1.0 - rot)
     plain = n
     n = unit(n + wp.vec3(fine - 0.5, fine2 - 0.5, fine3 - 0.5) * ((1.6 * dry + 0.8 * rot) * near))
     # light
@@ -423,7 +423,7 @@ def berry_light(
     colour += wp.cw_mul(transmission, light.sun_colour * sunny + ambient_light(light, -n, sky) * (0.35 * occlusion))
     grazing = 1.0 - wp.max(-wp.dot(n, d), 0.0)
     g2 = grazing * grazing
-    fresnel = 0.06 + 0.94 * g2 * g2 * grazing * 0.672
+    fresnel = 0.05 + 0.95 * g2 * g2 * grazing * 0.56
     peak = 1.0 - wp.max(wp.dot(n, unit(light.sun - d)), 0.0)
     bright = falling_exp(shininess * peak) * (shininess * 0.14 + 0.4) * wp.max(ndl + 0.05, 0.0)
     colour += light.sun_colour * (fresnel * lit * bright)

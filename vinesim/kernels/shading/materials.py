@@ -308,7 +308,7 @@ def turned_colour(
 def bloom_cover(seed: float, pale: float, red: float) -> float:
     """Returns the largest share of a berry's skin that bloom whitens: it lies thick on some berries and is rubbed off
     others. ``pale``, ``red``: 0 to 1, by the berry's colour."""
-    return (0.30 - 0.17 * pale - 0.06 * red) * (0.25 + 1.2 * trait(seed, 29.3))
+    return (0.28 - 0.16 * pale - 0.06 * red) * (0.2 + 1.2 * trait(seed, 29.3))
 
 
 @wp.func
@@ -323,7 +323,7 @@ def bloom_share(cover: float, hue: float, wide: float, fine: float, rise: float)
 
 @wp.func
 def bloom_colour(pale: float) -> wp.vec3:
-    return wp.vec3(0.33, 0.35, 0.46) + wp.vec3(0.07, 0.12, -0.22) * pale
+    return wp.vec3(0.20, 0.22, 0.36) + wp.vec3(0.14, 0.21, -0.20) * pale
 
 
 @wp.func
@@ -358,7 +358,7 @@ def berry_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: fl
     s.transmission = tint * (1.8 * (1.0 - rot)) * pale
     s.transmission += wp.vec3(0.26, 0.03, 0.012) * red + wp.vec3(0.03, 0.003, 0.004)
     bloom = bloom_cover(c4[0], pale, red)
-    s.specular = 0.06
+    s.specular = 0.05
     bm = bloom * 0.45
     fuzz = float(0.4)
     if pixel < a4[3] * 0.35:
@@ -386,7 +386,7 @@ def berry_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: fl
     s.albedo = mix(s.albedo, bloom_colour(pale), wp.clamp(bm, 0.0, 0.8))
     s.albedo = mix(s.albedo, wp.vec3(0.33, 0.30, 0.25), rot * 0.75 * fuzz)
     s.shininess = (70.0 - 72.0 * wp.min(bm, 0.75)) * (1.0 - 0.8 * rot)
-    s.reflectivity = 1.1 * (1.0 - wp.min(bm * 1.6, 0.85)) * (1.0 - rot)
+    s.reflectivity = 0.75 * (1.0 - wp.min(bm * 1.6, 0.85)) * (1.0 - rot)
     return s
 
 

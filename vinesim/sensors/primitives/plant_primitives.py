@@ -170,10 +170,11 @@ def _leaf_tints(colours: LeafColours, age: np.ndarray, tree: np.ndarray, rng: np
 
 
 def _turn_hue(linear: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """Returns linear RGB [n, 3] whose hue in sRGB is turned by ``turn`` [n] deg."""
+    """Returns linear RGB [n, 3] whose hue in sRGB is turned by ``turn`` [n] deg; towards blue it is also paler."""
     encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
     hsv = cv2.cvtColor(encoded[None].astype(np.float32), cv2.COLOR_RGB2HSV)[0]
     hsv[:, 0] = (hsv[:, 0] + turn) % 360.0
+    hsv[:, 1] *= 1.0 - 0.35 * np.clip(turn / 25.0, 0.0, 1.0)
     turned = cv2.cvtColor(hsv[None], cv2.COLOR_HSV2RGB)[0].astype(float)
     return np.where(turned <= 0.04045, turned / 12.92, ((turned + 0.055) / 1.055) ** 2.4)
 
