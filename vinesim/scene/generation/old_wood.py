@@ -158,7 +158,7 @@ def _add_spur(
         size = age * g.uniform(0.30, 0.75) * wide
         centre = head - rise * g.uniform(-0.05, 0.6)
         reach = wide * g.uniform(0.65, 1.15)
-        pieces.add(centre, centre + direction * reach, 1.15 * size, size, Organ.ARM, index)
+        pieces.add(centre, centre + direction * reach, 1.05 * size, size, Organ.ARM, index)
     for direction in random_directions(g, 1 + int(g.random() < 0.5)):
         direction = frames.normalize(direction + 0.9 * out)
         size = g.uniform(0.0048, 0.0078)
