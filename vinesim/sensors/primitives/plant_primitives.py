@@ -32,8 +32,6 @@ _WAX = 0.9
 photographs."""
 _NODE_WIDTH = 1.3
 """Thickness of a node, relative to the cane between nodes: GUESSED, by eye."""
-_LEAST_HUE_SPREAD = 9.0
-"""[deg] Least standard deviation of the hue from leaf to leaf: GUESSED."""
 _RIPE_WOOD = (0.3, 1.1)
 """Range of the share of a shoot, from its base, up to which it is brown at harvest: GUESSED."""
 _CANE_SPREAD = 0.07
@@ -165,7 +163,7 @@ def _leaf_tints(colours: LeafColours, age: np.ndarray, tree: np.ndarray, rng: np
     # a generator of its own: the shapes of leaves do not depend on the palette
     plain, waxy = np.random.default_rng(41).normal(size=(2, count))
     # wax makes some leaves bluer
-    turn = max(colours.hue_spread, _LEAST_HUE_SPREAD) * (plain + _WAX * np.clip(waxy, 0.0, 2.0))
+    turn = colours.hue_spread * (plain + _WAX * np.clip(waxy, 0.0, 2.0))
     return _turn_hue(np.clip(tint, 0.0, 1.0), turn)
 
 
