@@ -154,7 +154,7 @@ def test_amodal_masks_are_what_rays_meet_of_the_bunch_alone(grove) -> None:
 
 def test_a_wall_hides_and_truth_knows_how_much(grove) -> None:
     model, _, _ = grove
-    bunch = 22
+    bunch = 20
     rest = rest_snapshot(model)
     pose = _before(model, rest, bunch)
     forward, right = (frames.rotate(pose[3:], np.eye(3)[k]) for k in (2, 0))

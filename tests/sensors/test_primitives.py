@@ -9,10 +9,14 @@ import trimesh
 from tests.support import sensor_scenes
 from vinesim.core import frames
 from vinesim.scene.berries import lay_out_berries
+from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ, label
+from vinesim.scene.spec import load_scene
+from vinesim.sensors.primitives import textures
 from vinesim.sensors.primitives.bunch_primitives import Ripeness
+from vinesim.sensors.primitives.plant_primitives import cane_batches
 from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
-from vinesim.sensors.raster.primitive_arrays import SPHEROID
+from vinesim.sensors.raster.primitive_arrays import LEAF, SPHEROID
 
 
 @pytest.fixture(scope="module")
@@ -52,11 +56,34 @@ def test_every_bunch_has_its_berries_where_its_body_is(model, primitives) -> Non
 def test_every_leaf_cane_and_post_is_there(model, primitives) -> None:
     organ = primitives.organ
     kind = primitives.shapes.kind.numpy()
-    assert ((organ == int(Organ.LEAF)) & (kind == 2)).sum() == len(model.leaf_body)
+    assert ((organ == int(Organ.LEAF)) & (kind == LEAF)).sum() >= len(model.leaf_body)
     assert (organ == int(Organ.CANE)).sum() >= (model.body_organ == int(Organ.CANE)).sum()
     for o in (Organ.POLE, Organ.WIRE, Organ.TRUNK, Organ.ARM):
         expected = {label(o, int(i)) for i in model.fixed_index[model.fixed_organ == int(o)]}
         assert set(primitives.label[organ == int(o)]) == expected
+
+
+def test_small_leaves_take_their_area_from_the_leaf_in_whose_axil_they_stand(model, primitives) -> None:
+    """Weight and drag in the wind are those of the model's leaves, so the drawn blades have the same area in all."""
+    blades = (primitives.organ == int(Organ.LEAF)) & (primitives.shapes.kind.numpy() == LEAF)
+    assert blades.sum() > 1.2 * len(model.leaf_body)
+    outline = primitives.shapes.b.numpy()[blades, 3].astype(int)
+    size = primitives.shapes.a.numpy()[blades, 3] / textures.leaf_scale(outline)
+    for tree in range(0, len(model.tree_first), 7):
+        mine = primitives.label[blades] == label(Organ.LEAF, tree)
+        of_model = model.leaf_size[model.body_tree[model.leaf_body] == tree]
+        assert (size[mine] ** 2).sum() == pytest.approx((of_model**2).sum(), rel=1e-4)
+
+
+def test_canes_without_leaves_have_nodes_thicker_than_the_cane() -> None:
+    model = generate(load_scene("cordon"))
+    bare = np.setdiff1d(np.flatnonzero(model.body_organ == int(Organ.CANE)), model.leaf_body)
+    batches = cane_batches(model)
+    carrier = np.concatenate([batch.carrier for batch in batches])
+    radius = np.concatenate([batch.b[:, 3] for batch in batches])
+    assert len(bare) > 100
+    for body in bare[::50]:
+        assert radius[carrier == body].max() > 1.2 * model.body_radius[body, 0]
 
 
 def test_peduncles_carry_the_number_of_their_bunch(model, primitives) -> None:

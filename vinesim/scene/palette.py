@@ -51,7 +51,7 @@ class LeafColours(_Colours, frozen=True, kw_only=True):
     """Mean reflectance of the youngest leaves, at the tip of a shoot."""
     pale: Rgb = (0.030, 0.035, 0.0)
     """Reflectance that a pale leaf has in addition, once to twice."""
-    hue_spread: float = 0.0
+    hue_spread: float = 8.0
     """[deg] Standard deviation of the hue from leaf to leaf."""
     value_spread: float = 0.10
     """[1] Relative standard deviation of the reflectance from leaf to leaf, besides its dependence on age."""

@@ -24,13 +24,20 @@ from vinesim.kernels.shading.light_points import (
 )
 from vinesim.kernels.shading.materials import (
     GRASS,
-    Colours,
     Materials,
+    berry_occlusion,
+    blade_colour,
+    bloom_colour,
+    bloom_cover,
+    bloom_share,
     dry_cover,
+    leaf_sheen,
     mix,
     row_greenness,
     smoothstep,
     straw_cover,
+    trait,
+    turned_colour,
 )
 
 wp.set_module_options({"enable_backward": False, "fast_math": True, "cpu_compiler_flags": INLINE_ALL})
@@ -91,26 +98,33 @@ def sampled(table: wp.array2d(dtype=wp.float32), t: Texels, channel: int) -> flo
 
 
 @wp.func
-def autumn_colour(
-    tables: FloatTables, colours: Colours, albedo: wp.vec3, i: int, u: float, v: float, share: float
-) -> wp.vec3:
-    """Returns the albedo of leaf ``i`` at (u, v) [leaf units] in autumn: yellow from the edge inwards, then brown.
+def leaf_texels(outline: int, u: float, v: float) -> Texels:
+    """Returns the texels and weights for a bilinear sample at (u, v) [leaf units] of the texture of leaves with
+    ``outline``."""
+    x = wp.clamp((u + 1.0) * 64.0 - 0.5, 0.0, 126.0)
+    y = wp.clamp((v + 0.75) * 64.0 - 0.5, 0.0, 126.0)
+    column = int(x)
+    row = int(y)
+    fx = x - float(column)
+    fy = y - float(row)
+    o = Texels()
+    o.a = (outline * 128 + row) * 128 + column
+    o.b = o.a + 1
+    o.c = o.a + 128
+    o.d = o.a + 129
+    o.wa = (1.0 - fx) * (1.0 - fy)
+    o.wb = fx * (1.0 - fy)
+    o.wc = (1.0 - fx) * fy
+    o.wd = fx * fy
+    return o
 
-    ``share`` (0 to 1) is the weight of the autumn colour; 0 returns ``albedo`` unchanged.
-    """
-    age = wp.max(tables.d[i, 3] - 0.42, 0.0) * 1.7 * share
-    seed = tables.c[i, 3]
-    x = u * 0.13 + seed * 5.3
-    y = v * 0.13 + seed * 2.7
-    at = (int((y - wp.floor(y)) * 256.0) & 255) * 256 + (int((x - wp.floor(x)) * 256.0) & 255)
+
+@wp.func
+def edge_distance(tables: FloatTables, i: int, u: float, v: float) -> float:
+    """Returns the distance [leaf units] of (u, v) from the edge of leaf ``i``."""
     row = wp.clamp(int((v + 0.75) * 128.0), 0, 255)
     column = wp.clamp(int((u + 1.0) * 128.0), 0, 255)
-    edge = float(tables.outline[(int(tables.b[i, 3]) * 256 + row) * 256 + column]) * 0.0025
-    yellow = age * smoothstep(0.16 + 0.1 * age, 0.0, edge - 0.10 * tables.noise[at, 1])
-    yellow += 0.7 * smoothstep(0.62, 0.9, age) * tables.noise[at, 0]
-    yellow = wp.where(age > 0.02, wp.clamp(yellow, 0.0, 1.0), 0.0)
-    brown = smoothstep(0.03, 0.0, edge - 0.05 * tables.noise[at, 2] * age) * smoothstep(0.35, 0.6, age)
-    return mix(mix(albedo, colours.margin, yellow), colours.scorch, brown)
+    return float(tables.outline[(int(tables.b[i, 3]) * 256 + row) * 256 + column]) * 0.0025
 
 
 @wp.func
@@ -148,36 +162,28 @@ def blade_light(
     slope_v = -2.0 * tables.d[i, 1] * v
     plain = unit(side * slope_u + rib * slope_v + up)
     grass = wp.where(materials.material[i] == GRASS, 1.0, 0.0)
-    # the texture: vein, relief, tone
-    x = wp.clamp((u + 1.0) * 64.0 - 0.5, 0.0, 126.0)
-    y = wp.clamp((v + 0.75) * 64.0 - 0.5, 0.0, 126.0)
-    column = int(x)
-    row = int(y)
-    fx = x - float(column)
-    fy = y - float(row)
-    t = Texels()
-    t.a = (int(tables.b[i, 3]) * 128 + row) * 128 + column
-    t.b = t.a + 1
-    t.c = t.a + 128
-    t.d = t.a + 129
-    t.wa = (1.0 - fx) * (1.0 - fy)
-    t.wb = fx * (1.0 - fy)
-    t.wc = (1.0 - fx) * fy
-    t.wd = fx * fy
+    t = leaf_texels(int(tables.b[i, 3]), u, v)  # the texture: vein, relief, tone
     near = wp.where(size > pixel * 10.0, 1.0 - grass, 0.0)
-    clear = near * wp.clamp(wp.abs(wp.dot(up, d)) * 2.2, 0.0, 1.0) / (1.0 + 6.0 * pixel / size)
+    clear = near * wp.clamp(wp.abs(wp.dot(up, d)) * 2.2, 0.0, 1.0) / (1.0 + 3.0 * pixel / size)
     vein = sampled(tables.leaf_texture, t, 0) * clear
-    relief = 0.6 * clear
-    slope_u -= sampled(tables.leaf_texture, t, 1) * relief
-    slope_v -= sampled(tables.leaf_texture, t, 2) * relief
+    seed = tables.c[i, 3]
+    spots = texels_around(u * 0.13 + seed * 5.3, v * 0.13 + seed * 2.7)
+    hue = sampled(tables.noise, spots, 0)
+    wide = sampled(tables.noise, spots, 1)
+    middle = sampled(tables.noise, spots, 2)
+    wave = near * (0.5 + 0.9 * trait(seed, 57.77))
+    slope_u += (wide - 0.5) * wave - sampled(tables.leaf_texture, t, 1) * clear
+    slope_v += (middle - 0.5) * wave - sampled(tables.leaf_texture, t, 2) * clear
     bumpy = side * slope_u + rib * slope_v + up
     n = unit(mix(bumpy, plain * 0.5 + wp.vec3(0.0, 0.0, 0.8), grass))
-    tone = 1.0 + near * (sampled(tables.leaf_texture, t, 3) * 0.5 - 0.28)
-    tone = wp.where(grass > 0.5, 0.35 + 0.75 * (0.5 + 0.5 * v), tone)
-    albedo = row3(tables.tint, i) * tone
+    tint = row3(tables.tint, i)
+    tone = 0.5 + near * (sampled(tables.leaf_texture, t, 3) - 0.5)
+    albedo = mix(blade_colour(tint, tone, wide, middle, hue), tint * (0.35 + 0.75 * (0.5 + 0.5 * v)), grass)
     colours = materials.colours
-    albedo = autumn_colour(tables, colours, albedo, i, u, v, 1.0 - grass)
-    passing = mix(colours.through * (1.0 - 0.7 * vein), wp.vec3(0.7, 0.7, 0.7), grass)
+    age = wp.max(tables.d[i, 3] - 0.42, 0.0) * 1.7 * (1.0 - grass)
+    turned = turned_colour(colours, albedo, age, edge_distance(tables, i, u, v), vein, hue, wide, middle)
+    albedo = mix(albedo, turned, wp.where(age > 0.02, 1.0, 0.0))
+    passing = mix(colours.through * (1.0 - 0.45 * vein), wp.vec3(0.7, 0.7, 0.7), grass)
     transmission = wp.cw_mul(albedo, passing)
     # the lower side is paler, felted, with raised veins
     under = wp.where(wp.dot(plain, d) > 0.0, 1.0, 0.0)
@@ -185,9 +191,10 @@ def blade_light(
     above = (1.0 - under) * (1.0 - grass)
     felt = mix(albedo * 1.05, colours.under, 0.42)
     albedo = mix(mix(albedo, felt, below), colours.under_vein, below * vein * 0.7)
-    albedo = mix(albedo, colours.vein, above * vein * 0.40)
-    specular = 0.012 + 0.038 * above
-    shininess = 12.0 - 6.0 * below + 10.0 * above
+    albedo = mix(albedo, colours.vein, above * vein * 0.65)
+    gloss = trait(seed, 17.31)
+    specular = 0.012 + (0.023 + 0.03 * gloss) * above
+    shininess = 12.0 - 6.0 * below + (26.0 * gloss * gloss - 3.0) * above
     occlusion = wp.where(grass > 0.5, 0.35 + 0.65 * smoothstep(-0.75, 0.0, v), 1.0)
     sky = materials.sky[i]
     # light
@@ -211,7 +218,7 @@ def blade_light(
     surroundings = mix(
         light.ground_colour, mix(light.canopy_colour * 0.45, light.sky_colour, sky * sky), 0.5 + 0.5 * mirrored
     )
-    colour += surroundings * (wp.min(fresnel, 0.16) * 0.55 * above * occlusion)
+    colour += surroundings * (wp.min(fresnel, 0.16) * leaf_sheen(gloss) * above * occlusion)
     return haze(light, colour, z * scale)
 
 
@@ -366,12 +373,12 @@ def berry_light(
     dry = wp.max(tables.c[number, 3], 0.0)
     burnt = wp.max(-tables.c[number, 3], 0.0)
     pale = wp.clamp(tint[1] * 2.2, 0.0, 1.0)
-    occlusion = wp.clamp(1.0 - neighbours, 0.12 + 0.2 * pale, 1.0) * (0.4 + 0.6 * tables.c[number, 1])
+    occlusion = berry_occlusion(neighbours, pale, tables.c[number, 1])
     red = wp.clamp((tint[0] - tint[1]) * 4.0, 0.0, 1.0) * (1.0 - pale)
     wrap = wp.vec3(0.12, 0.06, 0.08) + wp.vec3(0.33, 0.34, 0.12) * pale + wp.vec3(0.2, 0.05, 0.02) * red
     transmission = tint * (1.8 * (1.0 - rot)) * pale
     transmission += wp.vec3(0.26, 0.03, 0.012) * red + wp.vec3(0.03, 0.003, 0.004)
-    bloom = 0.36 - 0.22 * pale - 0.06 * red
+    bloom = bloom_cover(seed, pale, red)
     near = wp.where(z * 2.0 / lens.fx < radius * 0.35, 1.0, 0.0)
     w = unit(e)
     t = texels_around(w[0] * 0.20 + seed * 7.1, w[1] * 0.20 + w[2] * 0.31 + seed * 3.3)
@@ -379,7 +386,7 @@ def berry_light(
     wide1 = sampled(tables.noise, t, 1)
     t = texels_around(w[0] * 1.1 + w[2] * 0.6 + seed, w[1] * 1.1 - w[2] * 0.4)
     fine = sampled(tables.noise, t, 1)
-    albedo = tint * (0.86 + 0.28 * wide1)
+    albedo = tint * (0.86 + 0.52 * wide1)
     amber = pale * 0.35 * wp.clamp(8.0 * (tint[0] / tint[1] - 0.8), 0.0, 1.0)
     albedo = mix(albedo, wp.vec3(0.46, 0.30, 0.06), amber * smoothstep(0.5, 0.8, wide0 + 0.15 * n[2]))
     fine2 = sampled(tables.noise, t, 2)
@@ -387,7 +394,7 @@ def berry_light(
     speck = wp.where(fine3 > 0.82, 0.22, 0.0)
     albedo = albedo * (1.0 + pale * (0.14 * fine2 - 0.07) + red * speck)
     along = wp.dot(w, axis)
-    dusty = bloom * smoothstep(0.30, 0.62, wide0 * 0.55 + wide1 * 0.45 + 0.12 * n[2]) * (0.75 + 0.5 * fine)
+    dusty = bloom_share(bloom, wide0, wide1, fine, n[2])
     albedo = mix(albedo, wp.vec3(0.07, 0.045, 0.025), smoothstep(0.986, 0.994, along))
     albedo = mix(albedo, wp.vec3(0.16, 0.18, 0.06), 0.7 * smoothstep(-0.95, -0.985, along))
     burn = burnt * smoothstep(-0.3, 0.5, n[2] + wide0 - 0.5)
@@ -395,10 +402,10 @@ def berry_light(
     fuzz = wp.where(near > 0.5, smoothstep(0.40, 0.65, fine), 0.4)
     albedo = mix(tint, albedo, near)
     dusty = wp.where(near > 0.5, dusty, bloom * 0.45) * (1.0 - rot) * (1.0 - 0.5 * dry)
-    albedo = mix(albedo, wp.vec3(0.40, 0.43, 0.60) + wp.vec3(0.0, 0.04, -0.36) * pale, wp.clamp(dusty, 0.0, 0.8))
+    albedo = mix(albedo, bloom_colour(pale), wp.clamp(dusty, 0.0, 0.8))
     albedo = mix(albedo, wp.vec3(0.33, 0.30, 0.25), rot * 0.75 * fuzz)
     shininess = (70.0 - 72.0 * wp.min(dusty, 0.75)) * (1.0 - 0.8 * rot)
-    reflectivity = 0.6 * (1.0 - wp.min(dusty * 1.6, 0.85)) * (1.0 - rot)
+    reflectivity = 0.75 * (1.0 - wp.min(dusty * 1.6, 0.85)) * (1.0 - rot)
     plain = n
     n = unit(n + wp.vec3(fine - 0.5, fine2 - 0.5, fine3 - 0.5) * ((1.6 * dry + 0.8 * rot) * near))
     # light
@@ -416,7 +423,7 @@ def berry_light(
     colour += wp.cw_mul(transmission, light.sun_colour * sunny + ambient_light(light, -n, sky) * (0.35 * occlusion))
     grazing = 1.0 - wp.max(-wp.dot(n, d), 0.0)
     g2 = grazing * grazing
-    fresnel = 0.045 + 0.955 * g2 * g2 * grazing * 0.504
+    fresnel = 0.05 + 0.95 * g2 * g2 * grazing * 0.56
     peak = 1.0 - wp.max(wp.dot(n, unit(light.sun - d)), 0.0)
     bright = falling_exp(shininess * peak) * (shininess * 0.14 + 0.4) * wp.max(ndl + 0.05, 0.0)
     colour += light.sun_colour * (fresnel * lit * bright)

@@ -261,6 +261,81 @@ def straw_cover(colours: Colours, sod: float, spots: float) -> float:
 
 
 @wp.func
+def trait(seed: float, factor: float) -> float:
+    """Returns a number from 0 to 1 that belongs to the leaf or berry with ``seed``; each ``factor`` gives another."""
+    x = seed * factor
+    return x - wp.floor(x)
+
+
+@wp.func
+def leaf_sheen(gloss: float) -> float:
+    """Returns how well a leaf mirrors its surroundings, from its ``gloss``, 0 to 1: GUESSED, by the blue of photographed
+    leaves below the sky."""
+    return 0.7 + 1.5 * gloss
+
+
+@wp.func
+def blade_colour(tint: wp.vec3, tone: float, wide: float, middle: float, hue: float) -> wp.vec3:
+    """Returns the albedo of a green blade at a point, from the leaf's mean ``tint`` and the ``tone`` of its texture.
+
+    ``wide``, ``middle`` and ``hue`` are noise around 0.5: brightness in large and in small patches, and yellowness.
+    """
+    warm = wp.clamp(hue - 0.58, -0.4, 0.4)
+    bright = (0.62 + 0.68 * tone) * (0.66 + 0.50 * wide + 0.18 * middle)
+    return wp.cw_mul(tint, wp.vec3(1.0 + 0.8 * warm, 1.0 + 0.35 * warm, 1.0 - 0.1 * warm)) * bright
+
+
+@wp.func
+def turned_colour(
+    colours: Colours, albedo: wp.vec3, age: float, edge: float, vein: float, hue: float, wide: float, middle: float
+) -> wp.vec3:
+    """Returns the albedo of an old leaf: yellow in blotches that follow its edge here and there and stay off its
+    veins, then brown.
+
+    ``age`` is 0 for a green leaf and 1 for the oldest; ``edge``: distance from the edge [leaf units]; ``vein``: 0 to 1;
+    ``hue``, ``wide``, ``middle``: noise around 0.5.
+    """
+    patch = smoothstep(0.38, 0.62, 0.8 * wide + 0.2 * middle)
+    ragged = edge - 0.40 * (wide - 0.35) - 0.22 * (middle - 0.4)
+    yellow = age * smoothstep(0.16 + 0.14 * age, -0.04, ragged) * (0.15 + 0.85 * patch)
+    yellow += 0.85 * smoothstep(0.50, 0.75, age) * smoothstep(0.30, 0.62, 0.5 * (wide + hue))
+    brown = smoothstep(0.02, -0.04, edge - 0.32 * (middle - 0.38) * age) * smoothstep(0.30, 0.6, age)
+    turned = mix(albedo, colours.margin, wp.min(yellow, 1.0) * (1.0 - 0.5 * vein))
+    return mix(turned, colours.scorch, brown)
+
+
+@wp.func
+def bloom_cover(seed: float, pale: float, red: float) -> float:
+    """Returns the largest share of a berry's skin that bloom whitens: it lies thick on some berries and is rubbed off
+    others. ``pale``, ``red``: 0 to 1, by the berry's colour."""
+    return (0.28 - 0.16 * pale - 0.06 * red) * (0.2 + 1.2 * trait(seed, 29.3))
+
+
+@wp.func
+def bloom_share(cover: float, hue: float, wide: float, fine: float, rise: float) -> float:
+    """Returns the share of bloom at a point of a berry, from its :func:`bloom_cover`.
+
+    ``hue``, ``wide``, ``fine``: noise around 0.5; ``rise``: vertical part of the normal. Bloom stays on upper sides.
+    """
+    rubbed = smoothstep(0.36, 0.60, 0.45 * wide + 0.55 * fine + 0.10 * rise)
+    return cover * (0.12 + 1.05 * rubbed) * (0.6 + 0.8 * hue)
+
+
+@wp.func
+def bloom_colour(pale: float) -> wp.vec3:
+    return wp.vec3(0.20, 0.22, 0.36) + wp.vec3(0.14, 0.21, -0.20) * pale
+
+
+@wp.func
+def berry_occlusion(hidden: float, pale: float, depth: float) -> float:
+    """Returns the share of light that reaches a point of a berry, of which neighbours hide the share ``hidden``.
+
+    Light comes through ``pale`` neighbours; ``depth``: relative distance from the bunch's axis, 0 to 1.
+    """
+    return wp.clamp(1.0 - hidden, 0.04 + 0.05 * pale, 1.0) * (0.15 + 0.85 * depth * depth)
+
+
+@wp.func
 def berry_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: float) -> Surface:
     a4 = g.a[i]
     b4 = g.b[i]
@@ -276,14 +351,14 @@ def berry_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: fl
     dry = wp.max(c4[3], 0.0)
     burnt = wp.max(-c4[3], 0.0)
     pale = wp.clamp(tint[1] * 2.2, 0.0, 1.0)  # pale berries transmit light, dark ones show bloom
-    # occlusion by neighbouring berries: a baked cosine lobe; light comes through pale neighbours
-    s.occlusion = wp.clamp(1.0 - block[3] - wp.dot(xyz(block), n), 0.12 + 0.2 * pale, 1.0) * (0.4 + 0.6 * c4[1])
+    # occlusion by neighbouring berries: a baked cosine lobe
+    s.occlusion = berry_occlusion(block[3] + wp.dot(xyz(block), n), pale, c4[1])
     red = wp.clamp((tint[0] - tint[1]) * 4.0, 0.0, 1.0) * (1.0 - pale)
     s.wrap = wp.vec3(0.12, 0.06, 0.08) + wp.vec3(0.33, 0.34, 0.12) * pale + wp.vec3(0.2, 0.05, 0.02) * red
     s.transmission = tint * (1.8 * (1.0 - rot)) * pale
     s.transmission += wp.vec3(0.26, 0.03, 0.012) * red + wp.vec3(0.03, 0.003, 0.004)
-    bloom = 0.36 - 0.22 * pale - 0.06 * red
-    s.specular = 0.045
+    bloom = bloom_cover(c4[0], pale, red)
+    s.specular = 0.05
     bm = bloom * 0.45
     fuzz = float(0.4)
     if pixel < a4[3] * 0.35:
@@ -293,12 +368,12 @@ def berry_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: fl
             materials.noise_texture, w[0] * 0.20 + seed * 7.1, w[1] * 0.20 + w[2] * 0.31 + seed * 3.3
         )
         fine = sample_bilinear(materials.noise_texture, w[0] * 1.1 + w[2] * 0.6 + seed, w[1] * 1.1 - w[2] * 0.4)
-        s.albedo = tint * (0.86 + 0.28 * wide[1])
+        s.albedo = tint * (0.86 + 0.52 * wide[1])
         amber = pale * 0.35 * wp.clamp(8.0 * (tint[0] / tint[1] - 0.8), 0.0, 1.0)
         s.albedo = mix(s.albedo, wp.vec3(0.46, 0.30, 0.06), amber * smoothstep(0.5, 0.8, wide[0] + 0.15 * n[2]))
         s.albedo = s.albedo * (1.0 + pale * (0.14 * fine[2] - 0.07) + red * wp.where(fine[3] > 0.82, 0.22, 0.0))
         along = wp.dot(w, axis)
-        bm = bloom * smoothstep(0.30, 0.62, wide[0] * 0.55 + wide[1] * 0.45 + 0.12 * n[2]) * (0.75 + 0.5 * fine[1])
+        bm = bloom_share(bloom, wide[0], wide[1], fine[1], n[2])
         scar = smoothstep(0.986, 0.994, along)
         s.albedo = mix(s.albedo, wp.vec3(0.07, 0.045, 0.025), scar)
         s.albedo = mix(s.albedo, wp.vec3(0.16, 0.18, 0.06), 0.7 * smoothstep(-0.95, -0.985, along))
@@ -308,10 +383,10 @@ def berry_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: fl
         fuzz = smoothstep(0.40, 0.65, fine[1])
         s.normal = wp.normalize(n + wp.vec3(fine[1] - 0.5, fine[2] - 0.5, fine[3] - 0.5) * (1.6 * dry + 0.8 * rot))
     bm = bm * (1.0 - rot) * (1.0 - 0.5 * dry)
-    s.albedo = mix(s.albedo, wp.vec3(0.40, 0.43, 0.60) + wp.vec3(0.0, 0.04, -0.36) * pale, wp.clamp(bm, 0.0, 0.8))
+    s.albedo = mix(s.albedo, bloom_colour(pale), wp.clamp(bm, 0.0, 0.8))
     s.albedo = mix(s.albedo, wp.vec3(0.33, 0.30, 0.25), rot * 0.75 * fuzz)
     s.shininess = (70.0 - 72.0 * wp.min(bm, 0.75)) * (1.0 - 0.8 * rot)
-    s.reflectivity = 0.6 * (1.0 - wp.min(bm * 1.6, 0.85)) * (1.0 - rot)
+    s.reflectivity = 0.75 * (1.0 - wp.min(bm * 1.6, 0.85)) * (1.0 - rot)
     return s
 
 
@@ -341,9 +416,12 @@ def leaf_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, d: wp.vec3
         s.occlusion = 0.35 + 0.65 * smoothstep(-0.75, 0.0, v)
     else:
         vein = float(0.0)
+        tone = float(0.5)
         age = wp.max(bend[3] - 0.42, 0.0) * 1.7  # leaves younger than 0.42 keep their colour
+        gloss = trait(c4[3], 17.31)
         near = size > pixel * 10.0
         number = int(b4[3])
+        spot = sample_bilinear(materials.noise_texture, u * 0.13 + c4[3] * 5.3, v * 0.13 + c4[3] * 2.7)
         if near:
             x = wp.clamp((u + 1.0) * 64.0 - 0.5, 0.0, 126.0)
             y = wp.clamp((v + 0.75) * 64.0 - 0.5, 0.0, 126.0)
@@ -357,13 +435,18 @@ def leaf_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, d: wp.vec3
                 + materials.leaf_texture[number, n + 1, m + 1] * fx
             )
             t = low * (1.0 - fy) + high * fy
-            clear = wp.clamp(wp.abs(wp.dot(up, d)) * 2.2, 0.0, 1.0) / (1.0 + 6.0 * pixel / size)
+            clear = wp.clamp(wp.abs(wp.dot(up, d)) * 2.2, 0.0, 1.0) / (1.0 + 3.0 * pixel / size)
             vein = t[0] * clear
-            relief = 0.6 * clear
-            s.normal = wp.normalize(side * (slope_u - t[1] * relief) + rib * (slope_v - t[2] * relief) + up)
-            s.albedo = s.albedo * (0.72 + 0.5 * t[3])
+            # the blade is puckered between its veins, and each leaf has waves of its own
+            wave = 0.5 + 0.9 * trait(c4[3], 57.77)
+            s.normal = wp.normalize(
+                side * (slope_u - t[1] * clear + (spot[1] - 0.5) * wave)
+                + rib * (slope_v - t[2] * clear + (spot[2] - 0.5) * wave)
+                + up
+            )
+            tone = t[3]
+        s.albedo = blade_colour(s.albedo, tone, spot[1], spot[2], spot[0])
         if age > 0.02:
-            spot = sample_nearest(materials.noise_texture, u * 0.13 + c4[3] * 5.3, v * 0.13 + c4[3] * 2.7)
             edge = (
                 float(
                     g.outline[
@@ -372,22 +455,16 @@ def leaf_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, d: wp.vec3
                 )
                 * 0.0025
             )
-            yellow = (
-                age * smoothstep(0.16 + 0.1 * age, 0.0, edge - 0.10 * spot[1])
-                + 0.7 * smoothstep(0.62, 0.9, age) * spot[0]
-            )
-            s.albedo = mix(s.albedo, materials.colours.margin, wp.clamp(yellow, 0.0, 1.0))
-            brown = smoothstep(0.03, 0.0, edge - 0.05 * spot[2] * age) * smoothstep(0.35, 0.6, age)
-            s.albedo = mix(s.albedo, materials.colours.scorch, brown)
-        s.transmission = wp.cw_mul(s.albedo, materials.colours.through) * (1.0 - 0.7 * vein)
+            s.albedo = turned_colour(materials.colours, s.albedo, age, edge, vein, spot[0], spot[1], spot[2])
+        s.transmission = wp.cw_mul(s.albedo, materials.colours.through) * (1.0 - 0.45 * vein)
         if wp.dot(plain, d) > 0.0:  # the lower side is paler, felted, with raised veins
             s.albedo = mix(s.albedo * 1.05, materials.colours.under, 0.42)
             s.albedo = mix(s.albedo, materials.colours.under_vein, vein * 0.7)
             s.specular = 0.012
             s.shininess = 6.0
         else:
-            s.albedo = mix(s.albedo, materials.colours.vein, vein * 0.40)
-            s.specular = 0.05
-            s.shininess = 22.0
-            s.reflectivity = 0.55
+            s.albedo = mix(s.albedo, materials.colours.vein, vein * 0.65)
+            s.specular = 0.035 + 0.03 * gloss
+            s.shininess = 9.0 + 26.0 * gloss * gloss
+            s.reflectivity = leaf_sheen(gloss)
     return s

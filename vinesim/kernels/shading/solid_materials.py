@@ -131,6 +131,47 @@ def solid_point(g: Shapes, materials: Materials, i: int, p: wp.vec3) -> SolidPoi
 
 
 @wp.func
+def bark_surface(materials: Materials, s: Surface, old: bool, grain: wp.vec3, seed: float, pixel: float) -> Surface:
+    """Returns surface ``s`` with the look of bark: fibrous strips of unlike width that cross, break off and peel.
+
+    Fissures of ``old`` bark are deeper. ``grain``, ``seed``, ``pixel``: as in :func:`woody_surface`.
+    """
+    tint = s.albedo
+    clear = 1.0 / (1.0 + pixel * 250.0)
+    bow = sample_bilinear(
+        materials.noise_texture, grain[2] * 0.9 + grain[0] * 1.9 + seed, grain[1] * 1.9 - grain[2] * 0.6
+    )
+    x = grain[0] + 0.022 * (bow[1] - 0.5)
+    y = grain[1] + 0.022 * (bow[2] - 0.5)
+    wide = sample_bilinear(materials.noise_texture, x * 4.6 + y * 1.3 + seed, grain[2] * 0.75 + y * 2.4 + x * 0.9)
+    fine = sample_bilinear(
+        materials.noise_texture, x * 7.0 - y * 5.5 - seed, grain[2] * 1.15 + (x + y) * 2.2 + seed * 0.7
+    )
+    height = 0.5 + ((0.40 * wide[2] + 0.26 * wide[3] + 0.34 * fine[2] + 0.25 * (bow[1] - 0.5)) - 0.5) * clear
+    ridge = smoothstep(0.36, 0.64, height)
+    relief = float(1.1)
+    if old:
+        grey = (tint[0] + tint[1] + tint[2]) / 3.0
+        s.albedo = mix(tint, wp.vec3(grey, grey, grey), 0.8 * wide[0]) * (
+            (0.42 + 0.75 * ridge) * (0.65 + 0.7 * wide[1])
+        )
+        s.albedo = mix(s.albedo, wp.vec3(0.150, 0.143, 0.130), 0.55 * smoothstep(0.46, 0.72, wide[0]) * ridge)
+        # inner bark where a strip has come off
+        s.albedo = mix(s.albedo, wp.vec3(0.120, 0.068, 0.040), 0.7 * smoothstep(0.60, 0.74, bow[1]))
+        relief = 1.7
+    else:
+        s.albedo = mix(materials.colours.bark_dark, materials.colours.bark_light, ridge) * (0.7 + 0.6 * wide[1])
+    s.occlusion = 0.35 + 0.65 * smoothstep(0.34, 0.54, height)
+    s.normal = wp.normalize(
+        s.normal
+        + wp.vec3(wide[2] + 0.7 * fine[3] - 0.85, fine[2] + 0.5 * wide[3] - 0.75, bow[2] + 0.6 * fine[1] - 0.8)
+        * (relief * clear)
+    )
+    s.specular = 0.009
+    return s
+
+
+@wp.func
 def woody_surface(
     materials: Materials, s: Surface, material: int, grain: wp.vec3, seed: float, p: wp.vec3, pixel: float
 ) -> Surface:
@@ -144,44 +185,22 @@ def woody_surface(
     near = pixel < 0.004
     if material == CANE:
         if near:
-            t = sample_bilinear(
-                materials.noise_texture, grain[0] * 9.0 + grain[1] * 7.0 + seed, grain[2] * 1.6 + seed * 3.1
+            # fine ribs along the cane, patches of unlike ripeness, dark specks
+            rib = sample_bilinear(
+                materials.noise_texture, grain[0] * 9.0 + grain[1] * 7.0 + seed, grain[2] * 0.7 + seed * 3.1
             )
-            s.albedo = mix(tint * (0.55 + 0.9 * t[2]), materials.colours.blotch, 0.5 * smoothstep(0.45, 0.7, t[0]))
-            s.normal = wp.normalize(n + wp.vec3(t[1] - 0.5, t[2] - 0.5, t[3] - 0.5) * (0.7 / (1.0 + pixel * 500.0)))
+            patch = sample_bilinear(
+                materials.noise_texture, grain[2] * 0.9 + seed * 1.7, grain[0] * 2.5 + grain[1] * 3.5 + seed
+            )
+            clear = 1.0 / (1.0 + pixel * 400.0)
+            s.albedo = tint * (1.0 + clear * (0.9 * (rib[2] - 0.5) + 0.5 * (rib[3] - 0.5)) + 0.7 * (patch[1] - 0.5))
+            s.albedo = mix(
+                s.albedo, materials.colours.blotch, 0.65 * smoothstep(0.50, 0.72, patch[0] * 0.6 + rib[0] * 0.4)
+            )
+            s.normal = wp.normalize(n + wp.vec3(rib[1] - 0.5, rib[2] - 0.5, rib[3] - 0.5) * (0.7 * clear))
         s.shininess = 14.0
-    elif material == BARK:
-        wide = sample_bilinear(
-            materials.noise_texture,
-            grain[0] * 2.6 + grain[2] * 0.24 + seed,
-            grain[1] * 2.6 - grain[2] * 0.10 + grain[0] * 0.4,
-        )
-        fine = sample_nearest(
-            materials.noise_texture, grain[0] * 6.0 + grain[2] * 0.45, grain[1] * 6.0 + grain[2] * 0.32 + seed
-        )
-        height = wide[2] * 0.6 + fine[1] * 0.4
-        s.albedo = mix(materials.colours.bark_dark, materials.colours.bark_light, smoothstep(0.25, 0.80, height))
-        s.occlusion = 0.6 + 0.4 * smoothstep(0.3, 0.55, height)
-        s.normal = wp.normalize(n + wp.vec3(wide[2] - 0.5, fine[1] - 0.5, (wide[3] - 0.5) * 0.3) * 1.0)
-        s.specular = 0.01
-    elif material == OLD_BARK:  # long deep fissures between fibrous ridges, with grey patches
-        wide = sample_bilinear(
-            materials.noise_texture, grain[0] * 5.2 + grain[2] * 0.42 + seed, grain[1] * 5.2 - grain[2] * 0.26 + seed
-        )
-        fine = sample_bilinear(
-            materials.noise_texture, grain[0] * 10.0 + grain[2] * 0.8 - seed, grain[1] * 10.0 + grain[2] * 0.55
-        )
-        clear = 1.0 / (1.0 + pixel * 250.0)
-        height = 0.5 + ((wide[2] * 0.62 + wide[1] * 0.16 + fine[2] * 0.22) - 0.5) * clear
-        ridge = smoothstep(0.36, 0.62, height)
-        s.albedo = tint * (0.34 + 0.95 * ridge)
-        grey = 0.5 * smoothstep(0.50, 0.72, wide[0]) * ridge
-        s.albedo = mix(s.albedo, wp.vec3(0.155, 0.150, 0.138), grey)
-        s.occlusion = 0.40 + 0.60 * smoothstep(0.33, 0.52, height)
-        s.normal = wp.normalize(
-            n + wp.vec3(wide[2] - 0.5 + 0.6 * (fine[3] - 0.5), fine[2] - 0.5, 0.7 * (wide[3] - 0.5)) * (2.2 * clear)
-        )
-        s.specular = 0.008
+    elif material == BARK or material == OLD_BARK:
+        s = bark_surface(materials, s, material == OLD_BARK, grain, seed, pixel)
     elif material == POST:
         wide = sample_bilinear(materials.noise_texture, grain[0] * 1.7 + grain[1] * 1.3 + seed, grain[2] * 0.35)
         fine = sample_nearest(materials.noise_texture, grain[0] * 6.0 + grain[1] * 5.0, grain[2] * 0.9 + seed)

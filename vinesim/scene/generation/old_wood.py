@@ -17,7 +17,7 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.spec import Scene
 
 SHOOTS_ON_SPUR = 2
-_KNOBS = 5
+_KNOBS = 8
 """Number of knobs of a spur head."""
 _ARM_BURLS = 4
 _ARM_STUBS = 2
@@ -150,7 +150,7 @@ def _add_spur(
     rise = middle - foot
     out = frames.normalize(rise)
     head = foot + rise * g.uniform(0.55, 0.75)
-    wide = age * g.uniform(0.016, 0.026) + (1.0 - age) * 0.007
+    wide = age * g.uniform(0.018, 0.034) + (1.0 - age) * 0.007
     root = float(np.clip(0.92 * thick, wide - MAX_STEP, wide + MAX_STEP))
     pieces.add(foot + out * 0.2 * thick, head, root, wide, Organ.ARM, index)
     for base in shoots:
@@ -158,10 +158,10 @@ def _add_spur(
         pieces.add(head, base, min(0.62 * wide, thin + MAX_STEP), thin, Organ.ARM, index)
     for direction in random_directions(g, _KNOBS):
         direction = frames.normalize(direction + 0.25 * out)
-        size = age * g.uniform(0.40, 0.8) * wide
-        centre = head - rise * g.uniform(0.0, 0.4)
-        reach = (wide + size) * g.uniform(0.5, 0.95)
-        pieces.add(centre, centre + direction * reach, 1.15 * size, size, Organ.ARM, index)
+        size = age * g.uniform(0.30, 0.75) * wide
+        centre = head - rise * g.uniform(-0.05, 0.6)
+        reach = wide * g.uniform(0.65, 1.15)
+        pieces.add(centre, centre + direction * reach, 1.05 * size, size, Organ.ARM, index)
     for direction in random_directions(g, 1 + int(g.random() < 0.5)):
         direction = frames.normalize(direction + 0.9 * out)
         size = g.uniform(0.0048, 0.0078)

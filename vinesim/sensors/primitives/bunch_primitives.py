@@ -33,9 +33,12 @@ _DRY_SIZE = 0.72
 """Size of a shrivelled berry, relative to a sound one [1]: GUESSED."""
 _BUNCH_SPREAD = np.array([0.08, 0.04, 0.10])
 """Standard deviations of the colour of bunches of wine grapes about that of their variety [1]: GUESSED."""
-_CROWDED = 0.21
+_CROWDED = 0.27
 """Mean share of light hidden by neighbours from which on the pedicel of a berry of a wine grape is not drawn: berries
 cover it. GUESSED."""
+_BULGE = 0.05
+"""How much a berry of a wine grape that others press on all sides bulges between them, relative to its radius: GUESSED.
+"""
 _SHOT_BERRY_SHARE = 0.06
 """Share of the berries of a completely unripe bunch that have stayed small and green ("shot berries"). GUESSED."""
 
@@ -241,6 +244,12 @@ class _Berries:
         colour = _ripe_colours(np.array([v.colour for v in varieties])[bunch], rngs, count)
         seed = np.concatenate([rng.uniform(size=n) for rng, n in zip(rngs, count, strict=True)])
         colour = colour * _bunch_tones(varieties, model.bunch_seed[which])[bunch]
+        first_berry = (np.cumsum(count) - count)[bunch][:, None]
+        near = np.concatenate([_padded_neighbours(one.neighbours) for one in layouts])
+        near = np.where(near >= 0, near + first_berry, -1)
+        is_wine = np.array([v.style != "table" for v in varieties])[bunch]
+        crowded = _neighbour_occlusion(position, radius, near)[:, 3] / _CROWDED
+        radius = radius * (1.0 + _BULGE * is_wine * np.clip(crowded, 0.0, 1.0))
         rot, dry, burnt = np.zeros((3, len(bunch)))
         if ripeness is not None:
             colour, radius = _ripen(colour, radius, ripeness, which, bunch, varieties)
@@ -249,8 +258,6 @@ class _Berries:
                 colour, radius = _spoil(colour, radius, rot, dry, burnt)
         away = np.hypot(*position[:, 1:].T)
         edge = np.array([_quantile_80(a) for a in np.split(away, np.cumsum(count)[:-1])])[bunch]
-        first_berry = (np.cumsum(count) - count)[bunch][:, None]
-        near = np.concatenate([_padded_neighbours(one.neighbours) for one in layouts])
         return cls(
             bunch=bunch,
             segment=bunches.segment_at(position, bunch),
@@ -262,9 +269,9 @@ class _Berries:
             colour=colour,
             seed=seed,
             depth=np.clip(0.35 + 0.65 * away / np.maximum(edge, 1e-6), 0.0, 1.0),
-            occlusion=_neighbour_occlusion(position, radius, np.where(near >= 0, near + first_berry, -1)),
+            occlusion=_neighbour_occlusion(position, radius, near),
             damage=np.stack([rot, dry - burnt], 1),
-            is_wine=np.array([v.style != "table" for v in varieties])[bunch],
+            is_wine=is_wine,
         )
 
     def fruit(self, bunches: _Bunches) -> Batch:
@@ -304,7 +311,7 @@ def _ripe_colours(variety: np.ndarray, rngs: list[np.random.Generator], count: n
     ``rngs``: [k] random generator of each bunch; ``count``: [k] number of berries of each bunch.
     """
     tone, blush = (np.concatenate([rng.normal(size=n) for rng, n in zip(rngs, count, strict=True)]) for _ in (0, 1))
-    colour = variety * (1.0 + 0.10 * tone[:, None])
+    colour = variety * (1.0 + 0.13 * tone[:, None])
     reddish = (colour[:, :1] > 2.0 * colour[:, 1:2]) * np.clip(0.5 * blush[:, None], 0.0, 1.0)
     return colour + np.array([0.055, 0.014, 0.010]) * reddish
 
@@ -412,8 +419,9 @@ def _padded_neighbours(neighbours: np.ndarray) -> np.ndarray:
 def _neighbour_occlusion(position: np.ndarray, radius: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
     """Returns the share of light that neighbouring berries hide from each berry, as (v, w) [n, 4].
 
-    At a surface point with unit normal m the hidden share is w + v . m. A neighbour of radius r at distance l hides
-    (1/4 + 0.85 cos) r^2 / l^2, with the cosine between m and the direction to the neighbour.
+    At a surface point with unit normal m the hidden share is w + v . m. A neighbour of radius r whose centre is at
+    distance l from that of a berry of radius R hides (0.09 + 0.68 cos) r^2 / (l - 0.55 R)^2, with the cosine between m
+    and the direction to the neighbour: GUESSED, by eye.
     """
     there = neighbours >= 0
     apart = position[np.maximum(neighbours, 0)] - position[:, None]
@@ -421,4 +429,4 @@ def _neighbour_occlusion(position: np.ndarray, radius: np.ndarray, neighbours: n
     direction = apart / np.maximum(distance, 1e-9)[..., None]
     gap = np.maximum(distance - 0.55 * radius[:, None], 0.3 * radius[:, None])
     weight = np.where(there, np.minimum(radius[np.maximum(neighbours, 0)] ** 2 / gap**2, 1.0), 0.0)
-    return np.concatenate([0.42 * (weight[..., None] * direction).sum(1), 0.07 * weight.sum(1, keepdims=True)], 1)
+    return np.concatenate([0.68 * (weight[..., None] * direction).sum(1), 0.09 * weight.sum(1, keepdims=True)], 1)

@@ -30,7 +30,7 @@ from vinesim.sensors.primitives.distant_rows import distant_batches, shaded_exte
 from vinesim.sensors.primitives.dormant_primitives import dormant_batches
 from vinesim.sensors.primitives.leaf_area_density import LeafDensity
 from vinesim.sensors.primitives.palette_colours import colour_struct
-from vinesim.sensors.primitives.plant_primitives import cane_batch, leaf_batches
+from vinesim.sensors.primitives.plant_primitives import NODE_BEFORE, NODE_BEYOND, cane_batches, leaf_batches
 from vinesim.sensors.primitives.primitive_batches import Batch, placeholder_batch
 from vinesim.sensors.primitives.primitive_clusters import ClusterLayout, join_rigid, lay_out
 from vinesim.sensors.primitives.rigid_primitives import rigid_batches
@@ -241,7 +241,7 @@ class Primitives:
         corners ``low`` and ``high`` [2] m."""
         model = self.model
         static = self._static_carrier
-        batches = [cane_batch(model), *leaf_batches(model), *dormant_batches(model)]
+        batches = [*cane_batches(model), *leaf_batches(model), *dormant_batches(model)]
         every = np.arange(len(model.bunch_body))
         pieces = [bunch_bodies(model, int(bunch)) for bunch in every]
         batches += bunch_batches(model, every, None, pieces, model.body_tree[model.bunch_body], self._ripeness)
@@ -415,7 +415,10 @@ class Primitives:
         is_wood = np.isin(organ, (Organ.CANE, Organ.SPUR)) & (start[:, :3] == 0.0).all(1) & (end[:, 1:3] == 0.0).all(1)
         place[is_wood] = np.nan
         is_node = (organ == int(Organ.CANE)) & (material == int(materials.CANE)) & ~is_wood
-        place[is_node] += 7.0 / 11.0 * (end[is_node, 0] - start[is_node, 0])
+        is_swelling = is_node & (start[:, 1:3] == 0.0).all(1)
+        before = NODE_BEFORE / (NODE_BEFORE + NODE_BEYOND)
+        place[is_swelling] += before * (end[is_swelling, 0] - start[is_swelling, 0])
+        place[is_node] = np.maximum(place[is_node], 0.0)
         nodes = model.nodes
         index = self._columns["label"].numpy()[rows] % LABEL_STRIDE
         of_bud = np.flatnonzero(nodes.bud >= 0)  # buds are numbered in the order of their nodes

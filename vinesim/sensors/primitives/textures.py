@@ -171,7 +171,7 @@ def _leaf_texture() -> disk_cache.Arrays:
             turn = np.radians(angle)
             tip = length * np.array([np.sin(turn), np.cos(turn)])
             away, along = _segment(u, v, np.zeros(2), tip)
-            vein = np.maximum(vein, np.exp(-((away / (0.017 * (1.0 - 0.7 * along))) ** 2)))
+            vein = np.maximum(vein, np.exp(-((away / (0.018 * (1.0 - 0.65 * along))) ** 2)))
             away_from_vein = np.minimum(away_from_vein, away)
             for start in np.linspace(0.14, 0.88, 6) + rng.normal(0.0, 0.015, 6):
                 for side in (1.0, -1.0):
@@ -183,18 +183,18 @@ def _leaf_texture() -> disk_cache.Arrays:
                     end = knee + 0.5 * reach * np.array([np.sin(bent), np.cos(bent)])
                     for first, last, wide in ((root, knee, 0.010), (knee, end, 0.007)):
                         away, along = _segment(u, v, first, last)
-                        vein = np.maximum(vein, 0.55 * np.exp(-((away / (wide * (1.0 - 0.3 * along))) ** 2)))
+                        vein = np.maximum(vein, 0.62 * np.exp(-((away / (wide * (1.0 - 0.3 * along))) ** 2)))
                         away_from_vein = np.minimum(away_from_vein, away)
         fine = _smooth_noise(rng, 3.0)
         wide = _smooth_noise(rng, 9.0)
         net = np.exp(-((fine / 0.25) ** 2))  # areoles: where a band-limited noise crosses zero
-        puffed = 1.0 - np.exp(-((away_from_vein / 0.07) ** 2))  # the blade rises between its veins
-        height = 0.008 * puffed + 0.010 * wide + 0.0015 * fine
+        puffed = 1.0 - np.exp(-((away_from_vein / 0.06) ** 2))  # the blade rises between its veins
+        height = 0.014 * puffed + 0.008 * wide + 0.0016 * fine
         slope_v, slope_u = np.gradient(height, 2.0 / TEXTURE_SIZE)
-        tone = 0.5 + 0.14 * wide + 0.07 * fine
+        tone = 0.47 + 0.12 * wide + 0.08 * fine + 0.15 * np.exp(-((away_from_vein / 0.024) ** 2))
         for spot_u, spot_v, size in rng.uniform((-0.7, -0.4, 0.008), (0.7, 0.8, 0.03), (6 * (shape % 4 > 1), 3)):
             tone -= 1.3 * np.exp(-((np.hypot(u - spot_u, v - spot_v) / size) ** 4))  # spots of blight
-        table[shape] = np.stack([np.maximum(vein, 0.15 * net), slope_u, slope_v, tone], -1)
+        table[shape] = np.stack([np.maximum(vein, 0.16 * net), slope_u, slope_v, tone], -1)
     table[GRASS_OUTLINE, ..., 3] = 0.5 + 0.5 * v
     table[HERB_OUTLINE, ..., 0] = 0.6 * np.exp(-((u / 0.03) ** 2))
     table[HERB_OUTLINE, ..., 3] = 0.5
