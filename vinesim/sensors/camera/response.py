@@ -166,6 +166,10 @@ class Response:
         """Returns the exposure for ``radiance`` [sample] at simulated ``time`` [s]; ``brightness``: of the daylight."""
         return float(self._meter.update(radiance, time, brightness).numpy()[0])
 
+    def most_light(self, exposure: float) -> float:
+        """Returns the radiance that the light of one sample counts as at most, so that edges of lights are smooth."""
+        return _MOST_LIGHT * self.spec.white.value / max(exposure, 1e-9)
+
     def light(self, radiance: wp.array, exposure: float) -> np.ndarray:
         """Returns linear RGB [height, width, 3] of the pixels, before the lens blurs it. The array may be that of
         ``radiance`` [sample].
@@ -174,7 +178,7 @@ class Response:
         """
         source = radiance
         if self.samples > 1 or self.device != "cpu":
-            most = _MOST_LIGHT * self.spec.white.value / max(exposure, 1e-9)
+            most = self.most_light(exposure)
             wp.launch(
                 colour_response.average_samples,
                 self.width * self.height,
