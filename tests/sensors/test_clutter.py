@@ -220,7 +220,7 @@ def test_counts_are_bounded() -> None:
         + distant_rows.MAX_CLUMPS
         + distant_rows.MAX_TUFTS
         + distant_rows.WOOD_OF_VINE * distant_rows.MAX_VINES
-        + distant_rows.WOOD_OF_NEAR_VINE * 400
+        + distant_rows.WOOD_OF_NEAR_VINE * 1.2 * distant_rows.MAX_DETAILED
         + 70 * 61
     )
     parts = [b for b in batches if not (b.organ == int(Organ.WIRE)).all() and not (b.organ == int(Organ.POLE)).all()]

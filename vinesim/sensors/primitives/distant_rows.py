@@ -1,9 +1,9 @@
 """Rows of vines beyond those of the scene, grass below them, and trees behind them, with correct depth and labels.
 
 A road, ``clutter.headland`` wide, separates them from the scene's own vines, so robots do not drive through rows that
-they cannot touch. A vine is a trunk, two arms, and leaves: up to :data:`DETAILED` away single leaves, shoots, spur heads
-and wires, farther away *clumps*: leaf blades with the outline of a dozen leaves, larger and fewer with the distance.
-Open sides have a meadow of tall grass. Labels have the index :data:`~vinesim.scene.ids.NO_OBJECT`, those of grass are
+they cannot touch. A vine is a trunk, two arms, and leaves: up to :data:`DETAILED` away single leaves, shoots, spur
+heads and wires, farther away *clumps*: leaf blades with the outline of a dozen leaves, larger and fewer with the
+distance. Open sides have a meadow of tall grass. Labels have the index :data:`~vinesim.scene.ids.NO_OBJECT`, those of grass are
 the ground's. Distant vines carry no fruit.
 """
 
@@ -27,11 +27,13 @@ REACH = 60.0
 """[m] Largest distance of distant vines from the scene's outermost vines."""
 DETAILED = 10.0
 """[m] Distance up to which distant vines have single leaves."""
+MAX_DETAILED = 500
 MAX_LEAVES = 36_000
 MAX_CLUMPS = 24_000
 MAX_VINES = 4_000
 MAX_TUFTS = 22_000
-"""Largest numbers of single leaves, clumps, vines and tufts of grass; larger vineyards have sparser ones."""
+"""Largest numbers of vines with single leaves (about), of single leaves, clumps, vines and tufts of grass; larger
+vineyards have sparser ones."""
 WOOD_OF_VINE = 5
 WOOD_OF_NEAR_VINE = 60
 """Largest numbers of pieces of wood of a distant vine, and of the additional ones of a vine with single leaves."""
@@ -103,7 +105,10 @@ def distant_batches(model: Model, static_carrier: int) -> list[Batch]:
     if len(place) > MAX_VINES:
         kept = np.argsort(_away(yard, place), kind="stable")[:MAX_VINES]
         place = place[np.sort(kept)]
-    is_near = _away(yard, place) <= DETAILED
+    away = _away(yard, place)
+    is_near = away <= DETAILED
+    if is_near.sum() > MAX_DETAILED:
+        is_near &= away <= np.sort(away)[MAX_DETAILED - 1]
     bare = rng.uniform(*_BARE)
     parts = [_wood(model, yard, rng, place, static_carrier)]
     parts += _near_wood(model, yard, rng, place[is_near], static_carrier)
@@ -395,9 +400,8 @@ def _clumps(
     if yard.is_overhead:
         rib = rng.normal(size=(n, 3))
     rib = frames.normalize(rib - up * (rib * up).sum(1, keepdims=True))
-    where[:, 2] -= np.minimum(
-        0.25 * wide * rib[:, 2], where[:, 2] - ground_height(model.terrain, *where[:, :2].T) - wide
-    )
+    low = ground_height(model.terrain, *where[:, :2].T) + wide
+    where[:, 2] = np.maximum(where[:, 2] - 0.25 * wide * rib[:, 2], low)
     tint = _foliage_tints(model, rng, n) * (1.0 - 0.6 * inner[:, None])
     return [_blades(where, wide, rib, up, tint, rng, static_carrier)]
 
