@@ -358,7 +358,7 @@ def _near_leaves(
     hanging = 0.55 * rng.normal(size=(n, 3)) + 0.5 * up - [0.0, 0.0, 0.9]
     rib = frames.normalize(hanging - up * (hanging * up).sum(1, keepdims=True))
     shape = leaves.blade_shape(rng.integers(1 << 16, size=n))
-    tint = _foliage_tints(model, rng, n) * (1.0 - 0.6 * inner[:, None])
+    tint = _foliage_tints(model, rng, n) * (1.0 - 0.75 * inner[:, None])
     blade = make_batch(
         LEAF,
         stack_columns(where, size * textures.leaf_scale(shape)),
@@ -402,7 +402,7 @@ def _clumps(
     rib = frames.normalize(rib - up * (rib * up).sum(1, keepdims=True))
     low = ground_height(model.terrain, *where[:, :2].T) + wide
     where[:, 2] = np.maximum(where[:, 2] - 0.25 * wide * rib[:, 2], low)
-    tint = _foliage_tints(model, rng, n) * (1.0 - 0.6 * inner[:, None])
+    tint = _foliage_tints(model, rng, n) * (1.0 - 0.75 * inner[:, None])
     return [_blades(where, wide, rib, up, tint, rng, static_carrier)]
 
 
@@ -428,7 +428,7 @@ def _grass(
     n = len(spot)
     if not n:
         return []
-    tall = 0.04 + 0.10 * rng.uniform(size=n) ** 2 + 0.007 * away + 0.14 * below * rng.uniform(size=n) ** 3
+    tall = 0.035 + 0.10 * rng.uniform(size=n) ** 3 + 0.005 * away + 0.16 * below * rng.uniform(size=n) ** 3
     tall = np.minimum(tall, 0.30)
     tall = np.where(meadow, rng.uniform(0.25, 0.55, n) * (1.0 + 0.5 * (noise[:, 2] - 0.5)) + 0.01 * away, tall)
     yaw = rng.uniform(0.0, 2.0 * np.pi, n)
