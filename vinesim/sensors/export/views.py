@@ -32,16 +32,12 @@ MIN_ACTOR_SHARE = 0.01
 """Least share of a picture's pixels that show actors or boxes, in scenes that have any."""
 MIN_PLANT_SHARE = 0.02
 """Least share of the pixels of a picture without bunches that show a plant."""
-SUBJECT_ORGANS: dict[str, tuple[Organ, ...]] = {
-    "leaves": (Organ.LEAF,),
-    "wood": (Organ.TRUNK, Organ.ARM),
-    "ground": (Organ.GROUND,),
-    "any": (),
-}
-"""Subjects of pictures without bunches, and the organs of the primitives that are in their middle."""
+SUBJECT_ORGANS = {"leaves": (Organ.LEAF,), "wood": (Organ.TRUNK, Organ.ARM)}
+"""Organs of the primitives that are in the middle of pictures without bunches, by their subject."""
 SUBJECT_PITCH = {"leaves": (-0.3, 0.5), "wood": (-0.6, 0.3), "ground": (-1.3, -0.4)}
 """Least and greatest angle [rad] by which the camera looks up at each subject."""
-SUBJECTS = tuple(SUBJECT_ORGANS)
+SUBJECTS = (*SUBJECT_PITCH, "any")
+"""Subjects of pictures without bunches, besides places where bunches were picked."""
 _SUBJECT_REACH = 8.0
 """Largest horizontal distance [m] of a subject from a bunch."""
 BUNCHES_PER_DRAW = 10
@@ -185,7 +181,7 @@ class ViewFinder:
         """Returns a view without bunches in which a plant is visible, and the drawn values: a close view of leaves, of
         wood or of the ground, or a view from a free place near a random hanging bunch in any direction."""
         subject = SUBJECTS[int(rng.integers(len(SUBJECTS)))]
-        found = self._of_subject(rng, entry, info, subject) if SUBJECT_ORGANS[subject] else None
+        found = self._of_subject(rng, entry, info, subject) if subject in SUBJECT_PITCH else None
         if found is not None:
             return found
         hanging = self._hanging_bunches()
@@ -211,15 +207,12 @@ class ViewFinder:
     ) -> tuple[PixelBuffers, dict[str, Any]] | None:
         """Returns a close view of the ``subject``, one of :data:`SUBJECTS`, without bunches; None if there is none."""
         terrain = self.primitives.model.terrain
-        place = self.primitives.shapes.a.numpy()[:, :3].astype(float)
-        around = self._middle_of_bunch(int(self._hanging_bunches()[0]))
-        is_target = np.isin(self.primitives.organ, SUBJECT_ORGANS[subject])
-        targets = np.flatnonzero(is_target & (np.linalg.norm(place[:, :2] - around[:2], axis=1) < _SUBJECT_REACH))
-        if not len(targets):
+        places = self._subject_places(subject)
+        if not len(places):
             return None
         least, most = SUBJECT_PITCH[subject]
         for _ in range(_TRIES_OF_SUBJECT):
-            target = place[targets[rng.integers(len(targets))]]
+            target = places[rng.integers(len(places))]
             heading, pitch, roll = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(least, most), draw_number(rng, entry.roll)
             away = draw_number(rng, entry.distance)
             pose = _pose(target, heading, pitch, roll)
@@ -230,6 +223,19 @@ class ViewFinder:
             if (seen := self._plants_alone(pose, info)) is not None:
                 return seen, {"subject": subject, "pitch": pitch, "roll": roll, "distance": away}
         return None
+
+    def _subject_places(self, subject: str) -> np.ndarray:
+        """Returns places [n, 3] m of a subject near bunches."""
+        around = self._middle_of_bunch(int(self._hanging_bunches()[0]))
+        if subject == "ground":
+            steps = np.arange(-_SUBJECT_REACH, _SUBJECT_REACH, 0.5)
+            x, y = (grid.ravel() for grid in np.meshgrid(around[0] + steps, around[1] + steps))
+            places = np.stack([x, y, np.zeros(x.size)], 1)
+            places[:, 2] += ground_height(self.primitives.model.terrain, x, y)
+        else:
+            is_subject = np.isin(self.primitives.organ, SUBJECT_ORGANS[subject])
+            places = self.primitives.shapes.a.numpy()[is_subject, :3].astype(float)
+        return places[np.linalg.norm(places[:, :2] - around[:2], axis=1) < _SUBJECT_REACH]
 
     def _plants_alone(self, pose: np.ndarray, info: CameraInfo) -> PixelBuffers | None:
         """Returns what a camera at ``pose`` [7] sees if that is a plant, no bunch, and nothing too near; else None."""
