@@ -53,7 +53,7 @@ _MEADOW = (2.5, 7.0)
 """[m] Least and greatest distance at which a meadow on an open side begins."""
 _TREES = (14.0, 60.0)
 """[m] Least and greatest distance of trees on sides without rows, from the scene's outermost vines."""
-_TREE_CLUMPS = 60
+_TREE_CLUMPS = 150
 _MAX_TREES = 70
 _CELL = 4.0
 """Width [m] of the squares of ground by which primitives are grouped in clusters."""
@@ -517,11 +517,11 @@ def _trees(
     tree = np.repeat(rows, _TREE_CLUMPS)
     n = len(tree)
     direction = frames.normalize(rng.normal(size=(n, 3)))
-    reach = rng.uniform(0.35, 1.0, (n, 1)) ** 0.5
+    reach = rng.uniform(0.25, 1.0, (n, 1)) ** 0.5
     wide = (0.34 * tall * rng.uniform(0.8, 1.3, count))[tree]
     crown = foot + stack_columns(0.0, 0.0, 0.62 * tall)
     where = crown[tree] + direction * reach * np.stack([wide, wide, 0.38 * tall[tree]], 1)
-    size = 0.17 * tall[tree] * rng.uniform(0.7, 1.2, n)
+    size = 0.10 * tall[tree] * rng.uniform(0.6, 1.3, n)
     ground = ground_height(model.terrain, *where[:, :2].T)
     where[:, 2] = np.maximum(where[:, 2], ground + 0.05 + size)
     up = frames.normalize(direction + 0.4 * rng.normal(size=(n, 3)))
