@@ -3,8 +3,8 @@
 A road, ``clutter.headland`` wide, separates them from the scene's own vines, so robots do not drive through rows that
 they cannot touch. A vine is a trunk, two arms, and leaves: up to :data:`DETAILED` away single leaves, shoots, spur
 heads and wires, farther away *clumps*: leaf blades with the outline of a dozen leaves, larger and fewer with the
-distance. Open sides have a meadow of tall grass. Labels have the index :data:`~vinesim.scene.ids.NO_OBJECT`, those of grass are
-the ground's. Distant vines carry no fruit.
+distance. Open sides have a meadow of tall grass. Labels have the index :data:`~vinesim.scene.ids.NO_OBJECT`, those of
+grass are the ground's. Distant vines carry no fruit.
 """
 
 from __future__ import annotations
