@@ -221,7 +221,7 @@ def test_counts_are_bounded() -> None:
         + distant_rows.MAX_TUFTS
         + distant_rows.WOOD_OF_VINE * distant_rows.MAX_VINES
         + distant_rows.WOOD_OF_NEAR_VINE * 1.2 * distant_rows.MAX_DETAILED
-        + 70 * 151
+        + 110 * 101
     )
     parts = [b for b in batches if not (b.organ == int(Organ.WIRE)).all() and not (b.organ == int(Organ.POLE)).all()]
     stubs = 6 * 20 * (2 * 14 * 2 + 5)

@@ -25,13 +25,13 @@ from vinesim.sensors.raster.primitive_arrays import CONE, LEAF
 
 REACH = 60.0
 """[m] Largest distance of distant vines from the scene's outermost vines."""
-DETAILED = 10.0
+DETAILED = 8.0
 """[m] Distance up to which distant vines have single leaves."""
 MAX_DETAILED = 500
-MAX_LEAVES = 36_000
-MAX_CLUMPS = 24_000
+MAX_LEAVES = 28_000
+MAX_CLUMPS = 20_000
 MAX_VINES = 4_000
-MAX_TUFTS = 22_000
+MAX_TUFTS = 14_000
 """Largest numbers of vines with single leaves (about), of single leaves, clumps, vines and tufts of grass; larger
 vineyards have sparser ones."""
 WOOD_OF_VINE = 5
@@ -51,10 +51,12 @@ _GRASS_REACH = 18.0
 _SCENE_GRASS = 2.5
 _MEADOW = (2.5, 7.0)
 """[m] Least and greatest distance at which a meadow on an open side begins."""
+_MEADOW_HEIGHT = (0.3, 1.3)
+"""[m] Least and greatest mean height of the grass of a meadow: GUESSED, sown grass to reeds."""
 _TREES = (14.0, 60.0)
 """[m] Least and greatest distance of trees on sides without rows, from the scene's outermost vines."""
-_TREE_CLUMPS = 150
-_MAX_TREES = 70
+_TREE_CLUMPS = 100
+_MAX_TREES = 110
 _CELL = 4.0
 """Width [m] of the squares of ground by which primitives are grouped in clusters."""
 TREE_TINT = (0.026, 0.050, 0.013)
@@ -400,7 +402,7 @@ def _clumps(
     if yard.is_overhead:
         rib = rng.normal(size=(n, 3))
     rib = frames.normalize(rib - up * (rib * up).sum(1, keepdims=True))
-    low = ground_height(model.terrain, *where[:, :2].T) + wide
+    low = ground_height(model.terrain, *where[:, :2].T) + 1.3 * wide
     where[:, 2] = np.maximum(where[:, 2] - 0.25 * wide * rib[:, 2], low)
     tint = _foliage_tints(model, rng, n) * (1.0 - 0.75 * inner[:, None])
     return [_blades(where, wide, rib, up, tint, rng, static_carrier)]
@@ -430,7 +432,8 @@ def _grass(
         return []
     tall = 0.035 + 0.10 * rng.uniform(size=n) ** 3 + 0.005 * away + 0.16 * below * rng.uniform(size=n) ** 3
     tall = np.minimum(tall, 0.30)
-    tall = np.where(meadow, rng.uniform(0.25, 0.55, n) * (1.0 + 0.5 * (noise[:, 2] - 0.5)) + 0.01 * away, tall)
+    reeds = rng.uniform(*_MEADOW_HEIGHT) / 1.5  # a tuft of size 1 is 1.5 high
+    tall = np.where(meadow, reeds * rng.uniform(0.7, 1.3, n) * (0.7 + 0.6 * noise[:, 2]), tall)
     yaw = rng.uniform(0.0, 2.0 * np.pi, n)
     lean = rng.normal(0.0, 0.25, n)
     out = np.stack([np.cos(yaw), np.sin(yaw), np.zeros(n)], 1)
@@ -491,7 +494,7 @@ def _trees(
     count = _MAX_TREES
     side = rng.integers(4, size=count)
     near = np.where(is_open[side], _TREES[0], REACH + 4.0)
-    off = near + (_TREES[1] - near) * rng.uniform(size=count)
+    off = near + np.maximum(_TREES[1] - near, 8.0) * rng.uniform(size=count) ** 1.5
     along = rng.uniform(-1.0, 1.0, count)
     middle, half = 0.5 * (yard.low + yard.high), 0.5 * (yard.high - yard.low)
     axis = side // 2
@@ -523,7 +526,7 @@ def _trees(
     where = crown[tree] + direction * reach * np.stack([wide, wide, 0.38 * tall[tree]], 1)
     size = 0.10 * tall[tree] * rng.uniform(0.6, 1.3, n)
     ground = ground_height(model.terrain, *where[:, :2].T)
-    where[:, 2] = np.maximum(where[:, 2], ground + 0.05 + size)
+    where[:, 2] = np.maximum(where[:, 2], ground + 0.05 + 1.2 * size)
     up = frames.normalize(direction + 0.4 * rng.normal(size=(n, 3)))
     rib = frames.normalize(np.array([0.0, 0.0, 1.0]) + 0.5 * rng.normal(size=(n, 3)))
     rib = frames.normalize(rib - up * (rib * up).sum(1, keepdims=True))
