@@ -89,11 +89,9 @@ def test_only_colours_are_blurred() -> None:
     pose = look_at(np.array([1.0, -1.0, 1.1]), np.array([1.2, 0.0, 1.0]))
     spec = CameraSpec.load("dslr")
     info = spec.info("", size=(192, 128))
-    sharp = Camera(msgspec.structs.replace(spec, lens=None), info, quality="still", threads=1).render(primitives, pose)
-    soft = Camera(spec, info, quality="still", threads=1).render(primitives, pose)
-    wide_open = msgspec.structs.replace(spec.lens, f_number=_number(1.0, "1"))
-    softer = Camera(msgspec.structs.replace(spec, lens=wide_open), info, quality="still", threads=1).render(
-        primitives, pose
+    sharp, soft, softer = (
+        Camera(msgspec.structs.replace(spec, lens=lens), info, quality="still", threads=1).render(primitives, pose)
+        for lens in (None, _lens(2.8), _lens(1.0))
     )
     for one in (soft, softer):
         for name in ("labels", "exact_depth", "depth"):
