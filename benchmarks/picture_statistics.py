@@ -29,6 +29,16 @@ LEAST_VALUE = 0.1
 """Saturation and value (of HSV, 0 to 1) below which a pixel counts as without hue."""
 NEAR_WHITE = 250
 """Level of 0 to 255 that red, green and blue of a nearly white pixel reach."""
+SKY_VALUE = 0.75
+"""Value from which on a pixel may be sky."""
+SKY_SATURATION = 0.12
+SKY_HUES = (190.0, 250.0)
+"""[deg] A bright pixel counts as sky if its saturation is lower, or its hue in this range: white paint counts, too."""
+DETAIL_SIGMA = 1.5
+"""[px] Width of the Gaussian filter that separates fine detail from the rest of a picture that is 768 px wide."""
+DETAIL_WIDTH = 768
+DETAIL_QUANTILES = (0.1, 0.5)
+"""Quantiles over the blocks of a picture: of smooth or blurred parts, and of the middle."""
 NOISE_BLOCK = 16
 """[px] Width and height of the blocks in which noise is measured."""
 NOISE_QUANTILE = 0.1
@@ -101,6 +111,10 @@ def of_picture(picture: BunchPicture) -> dict[str, float]:
         found[f"{place}: spread of brightness"] = float(luma[is_there].std()) if is_there.any() else np.nan
     found["nearly white, share"] = _mean(rgb.min(-1) >= NEAR_WHITE)
     found["noise, levels of 255"] = noise_level(rgb @ np.array([0.299, 0.587, 0.114]))
+    is_blue = (saturation < SKY_SATURATION) | ((hue >= SKY_HUES[0]) & (hue < SKY_HUES[1]))
+    found["bright and pale or blue, share"] = _mean((value >= SKY_VALUE) & is_blue)
+    for quantile, level in zip(DETAIL_QUANTILES, detail_levels(255.0 * luma), strict=True):
+        found[f"fine detail, quantile {quantile:g}, levels of 255"] = level
     found["bunches, share of the picture"] = _mean(bunches > 0)
     return found | bunch_shapes(bunches)
 
@@ -122,6 +136,19 @@ def noise_level(levels: np.ndarray) -> float:
     middle = block_means(levels.astype(float))
     spreads = np.sqrt(block_means(high**2))[(middle >= UNCLIPPED[0]) & (middle <= UNCLIPPED[1])]
     return float(np.quantile(spreads, NOISE_QUANTILE)) if spreads.size else float("nan")
+
+
+def detail_levels(levels: np.ndarray) -> list[float]:
+    """Returns quantiles, over the blocks of a picture ``levels`` [height, width], 0 to 255, of the standard deviation
+    of its fine detail."""
+    height, width = levels.shape
+    if width != DETAIL_WIDTH:
+        size = (DETAIL_WIDTH, max(round(height * DETAIL_WIDTH / width), NOISE_BLOCK))
+        levels = cv2.resize(levels, size, interpolation=cv2.INTER_AREA if width > DETAIL_WIDTH else cv2.INTER_LINEAR)
+    fine = levels - cv2.GaussianBlur(levels, (0, 0), DETAIL_SIGMA, borderType=cv2.BORDER_REFLECT)
+    rows, columns = (size // NOISE_BLOCK for size in fine.shape)
+    blocks = fine[: rows * NOISE_BLOCK, : columns * NOISE_BLOCK].reshape(rows, NOISE_BLOCK, columns, NOISE_BLOCK)
+    return np.quantile(np.sqrt((blocks**2).mean((1, 3))), DETAIL_QUANTILES).tolist()
 
 
 def bunch_shapes(bunches: np.ndarray) -> dict[str, float]:

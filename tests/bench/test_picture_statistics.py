@@ -11,6 +11,7 @@ from PIL import Image
 
 from benchmarks.picture_statistics import (
     bunch_shapes,
+    detail_levels,
     mean_and_spread,
     noise_level,
     of_picture,
@@ -74,6 +75,21 @@ def test_a_smooth_picture_has_no_noise_even_if_the_rest_has_texture():
     levels = np.full((160, 160), 100.0)
     levels[:, 80:] += np.where(np.indices((160, 80)).sum(0) % 2, 30.0, -30.0)
     assert noise_level(levels) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_sky_is_bright_and_pale_or_blue():
+    for sky, share in (((215, 0.5, 0.9), 0.9), ((60, 0.05, 0.9), 0.9), ((90, 0.5, 0.9), 0.0), ((215, 0.5, 0.4), 0.0)):
+        found = of_picture(two_colours(coloured(25, 0.4, 0.6), coloured(*sky)))
+        assert found["bright and pale or blue, share"] == pytest.approx(share)
+
+
+def test_blur_takes_fine_detail_away_where_it_is():
+    """A checkerboard of 20 levels is nothing but detail, and a smooth picture has none."""
+    levels = 100.0 + 20.0 * np.where(np.indices((512, 768)).sum(0) % 2, 1.0, -1.0)
+    assert detail_levels(levels) == pytest.approx([20.0, 20.0], rel=0.01)
+    levels[:, :230] = np.linspace(50.0, 150.0, 230)
+    assert detail_levels(levels)[0] < 0.2
+    assert detail_levels(levels)[1] == pytest.approx(20.0, rel=0.01)
 
 
 def test_a_cane_across_a_bunch_makes_two_parts():

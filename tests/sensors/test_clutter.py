@@ -189,7 +189,7 @@ def test_rows_beyond_the_scene_leave_a_road_and_carry_no_ids(model, primitives) 
     poles = model.fixed_start[model.fixed_organ == int(Organ.POLE), :2]
     gap = np.maximum(np.maximum(poles.min(0) - place, place - poles.max(0)), 0.0)
     distance = np.linalg.norm(gap, axis=1)
-    assert distance.min() > distant_rows.HEADLAND - 0.3
+    assert distance.min() > EVERYTHING.headland - 0.3
     assert distance.max() < 110.0
     assert (primitives.organ[away] != int(Organ.BUNCH)).all()
 
@@ -216,9 +216,12 @@ def test_counts_are_bounded() -> None:
         + clutter.MAX_STRAW
         + 3 * clutter.MAX_PRUNINGS
         + 16 * clutter.MAX_TIES
+        + distant_rows.MAX_LEAVES
         + distant_rows.MAX_CLUMPS
-        + 5 * distant_rows.MAX_VINES
-        + 60 * 41
+        + distant_rows.MAX_TUFTS
+        + distant_rows.WOOD_OF_VINE * distant_rows.MAX_VINES
+        + distant_rows.WOOD_OF_NEAR_VINE * 1.2 * distant_rows.MAX_DETAILED
+        + 110 * 101
     )
     parts = [b for b in batches if not (b.organ == int(Organ.WIRE)).all() and not (b.organ == int(Organ.POLE)).all()]
     stubs = 6 * 20 * (2 * 14 * 2 + 5)

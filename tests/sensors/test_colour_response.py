@@ -14,7 +14,7 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.values import CameraMount, CameraOutput
 from vinesim.sensors.camera.camera import MAKER, Camera, CameraSpec
 from vinesim.sensors.camera.motion import Moments, Motion
-from vinesim.sensors.camera.response import LUMINANCE, ColourSpec, Response, compressed
+from vinesim.sensors.camera.response import LUMINANCE, ColourSpec, Response, compressed, sharpened
 from vinesim.sensors.sensor import SensorSetting
 from vinesim.sensors.spec_file import SensorError
 
@@ -32,7 +32,7 @@ NEUTRAL = {
     "chroma": (1.0, 1.0),
 }
 """Values without any effect: light in, sRGB out."""
-CAMERAS = ("d435", "phone", "raspberry_pi")
+CAMERAS = ("d435", "dslr", "phone", "raspberry_pi")
 SIZE = 256, 192
 
 
@@ -113,6 +113,17 @@ def test_blur_has_the_stated_width() -> None:
     seen = _linear(_developed(_spec(**NEUTRAL | {"blur": 1.5}), point))[..., 1]
     away = np.arange(41) - 20.0
     assert np.sqrt((seen.sum(0) * away**2).sum() / seen.sum()) == pytest.approx(1.5, rel=0.08)
+
+
+def test_sharpening_adds_to_edges_and_nothing_to_plains() -> None:
+    rgb = np.full((20, 40, 3), 80, np.uint8)
+    rgb[:, 20:] = 160
+    twice, once = (sharpened(rgb, strength).astype(float) for strength in (1.0, 0.5))
+    assert (twice[:, :14] == 80.0).all()
+    assert (twice[:, 26:] == 160.0).all()
+    # beside an edge of height h a Gaussian filter of sigma 1 px moves the level by h Phi(-0.5)
+    assert once[0, 20, 0] - 160.0 == pytest.approx(0.5 * 80.0 * 0.3085, abs=1.5)
+    assert twice - rgb == pytest.approx(2.0 * (once - rgb), abs=1.5)
 
 
 def test_white_balance_errs_by_image_as_stated() -> None:
@@ -377,5 +388,5 @@ def test_the_data_sheets_say_where_each_figure_is_from() -> None:
             number = getattr(spec.colour, field)
             assert number is None or len(number.source) > 5
         field_of_view = 2.0 * np.degrees(np.arctan(0.5 * spec.width.value / spec.fx.value))
-        if name != "d435":
+        if name not in ("d435", "dslr"):
             assert 62.0 <= field_of_view <= 78.0

@@ -664,7 +664,7 @@ def test_a_picture_and_its_truth(tmp_path: pathlib.Path) -> None:
 @pytest.mark.parametrize(
     ("changed", "error", "words"),
     [
-        ({"camera": "kinect"}, DataFileNotFound, "d435, phone, pinhole, raspberry_pi"),
+        ({"camera": "kinect"}, DataFileNotFound, "d435, dslr, phone, pinhole, raspberry_pi"),
         ({"size": "99999x4"}, SensorError, "16x16 to 4096x4096"),
         ({"size": "640*480"}, UsageError, "WxH"),
         ({"at": "1,2"}, UsageError, "X,Y,Z"),

@@ -1,5 +1,6 @@
 """Mixes: the law of draws, values that are refused in one line, and views, light and vineyards as the mix says."""
 
+import dataclasses
 import json
 import pathlib
 import re
@@ -13,9 +14,11 @@ from vinesim.core import frames
 from vinesim.core.data_files import data_dir
 from vinesim.scene.camera_geometry import project_points
 from vinesim.scene.generation.vineyard import generate_uncached
+from vinesim.scene.ids import LABEL_STRIDE, Organ
 from vinesim.scene.spec import Scene, sun_direction
 from vinesim.scene.values import CameraInfo
-from vinesim.sensors.export import dataset
+from vinesim.sensors import ground_truth
+from vinesim.sensors.export import dataset, views
 from vinesim.sensors.export.dataset import DatasetPlan, VineyardRenderer
 from vinesim.sensors.export.mix import LATITUDE, MixError, SunTable, draw_sun, load_mix
 from vinesim.sensors.export.views import BUNCHES_PER_DRAW, ViewFinder
@@ -243,6 +246,46 @@ def test_views_are_as_the_mix_says(finder: ViewFinder, tmp_path: pathlib.Path) -
             share = np.interp(drawn, steps, np.linspace(0.0, 1.0, len(steps)))
             assert np.quantile(share, [0.25, 0.5, 0.75]) == pytest.approx([0.25, 0.5, 0.75], abs=0.17)
     assert BUNCHES_PER_DRAW > 1
+
+
+@pytest.mark.slow
+def test_pictures_without_bunches_show_their_subjects(finder: ViewFinder) -> None:
+    entry = load_mix("default").table.views[0]
+    rng = np.random.default_rng(4)
+    subjects = set()
+    for _ in range(24):
+        seen, values = finder.without_bunches(rng, entry, SMALL)
+        organs = seen.labels // LABEL_STRIDE
+        assert not (organs == Organ.BUNCH).any()
+        assert ((organs >= Organ.TRUNK) & (organs <= Organ.LEAF)).mean() >= views.MIN_PLANT_SHARE
+        least, most = views.SUBJECT_PITCH.get(values["subject"], (-1.2, 0.3))
+        assert least <= values["pitch"] <= most
+        subjects.add(values["subject"])
+    assert subjects == set(views.SUBJECTS)
+
+
+@pytest.mark.slow
+def test_views_after_the_harvest_are_those_of_bunches_but_for_the_bunches(finder: ViewFinder) -> None:
+    entry = load_mix("default").table.views[0]
+    rng = np.random.default_rng(5)
+    before = finder.snapshot
+    picked = dataclasses.replace(before, bunch_attached=np.zeros_like(before.bunch_attached))
+    later = dataclasses.replace(finder, snapshot=picked)
+    shown = []
+    for _ in range(12):
+        finder.primitives.update(picked)
+        found = later.of_picked(rng, entry, SMALL, before.bunch_attached)
+        finder.primitives.update(before)
+        assert found is not None
+        seen, values = found
+        assert values["subject"] == "picked"
+        assert not (seen.labels // LABEL_STRIDE == Organ.BUNCH).any()
+        same = ground_truth.render_buffers(finder.primitives, SMALL, seen.pose)
+        is_bunch = same.labels // LABEL_STRIDE == Organ.BUNCH
+        assert (seen.depth[is_bunch] >= same.depth[is_bunch]).all()
+        assert np.array_equal(seen.labels[~is_bunch], same.labels[~is_bunch])
+        shown.append(is_bunch.any())
+    assert np.mean(shown) > 0.7
 
 
 @pytest.mark.slow

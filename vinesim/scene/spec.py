@@ -150,6 +150,9 @@ class Clutter(_Part, frozen=True, kw_only=True):
     distant_rows: Share = 0.0
     """Rows of vines beyond the scene's own up to 60 m away, and trees behind them; 1: in every direction. Below 1 a
     share of the four sides is left open."""
+    headland: Annotated[float, msgspec.Meta(ge=1.0, le=50.0)] = 5.0
+    """[m] Least distance of distant vines from the scene's outermost vines. Below the spacings of rows and vines the
+    distant rows continue those of the scene, so robots should not leave the scene's own rows."""
 
 
 class Fruit(_Part, frozen=True, kw_only=True):

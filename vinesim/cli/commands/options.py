@@ -12,7 +12,7 @@ Scene = Annotated[
     str, typer.Option(help="A scene file, or the name of a shipped scene: cordon, demo, harvest, slope, tendone, vsp.")
 ]
 Device = Annotated[str, typer.Option(help="cpu, cuda or cuda:N (an NVIDIA GPU).")]
-Camera = Annotated[str, typer.Option(help="A camera file, or d435, phone, pinhole, raspberry_pi.")]
+Camera = Annotated[str, typer.Option(help="A camera file, or d435, dslr, phone, pinhole, raspberry_pi.")]
 Colour = Annotated[
     str, typer.Option(help="camera: colours, noise and clipping of the camera's file. exact: without them.")
 ]

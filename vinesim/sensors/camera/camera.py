@@ -26,6 +26,7 @@ from vinesim.kernels.stereo import stereo_rows
 from vinesim.scene.plant_parameters import Number
 from vinesim.scene.values import CameraFrame, CameraInfo, CameraMount, CameraOutput, Snapshot
 from vinesim.sensors import spec_file
+from vinesim.sensors.camera.defocus import LensSpec, automatic_focus, defocused
 from vinesim.sensors.camera.exposure import Exposure
 from vinesim.sensors.camera.live_light import LiveLight
 from vinesim.sensors.camera.live_light import shadow_maps as shadow_maps_of
@@ -64,6 +65,9 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     (rational_polynomial); None: a pinhole. Colour, depth and labels have equal distortion."""
     colour: ColourSpec | None = None
     """How light becomes 8-bit colours; None: exact colours, with neither noise nor clipping."""
+    lens: LensSpec | None = None
+    """Aperture and focus, which blur what is out of focus; None: everything is in focus. Only for cameras with
+    ``colour``."""
 
     @classmethod
     def load(cls, name: str) -> CameraSpec:
@@ -80,6 +84,8 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
             raise spec_file.SensorError(f"camera {name!r}: {error}") from error
         if spec.colour is not None:
             spec.colour.check(name)
+        elif spec.lens is not None:
+            raise spec_file.SensorError(f"camera {name!r} has a table lens but none with its colours; give colour, too")
         return spec
 
     def mounted(self, mount: CameraMount) -> CameraSpec:
@@ -101,15 +107,15 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         another word."""
         if colour not in COLOURS:
             raise spec_file.SensorError(f"colour is {colour!r}; give {' or '.join(COLOURS)}")
-        return self if colour == "camera" else msgspec.structs.replace(self, colour=None)
+        return self if colour == "camera" else msgspec.structs.replace(self, colour=None, lens=None)
 
     def ideal(self) -> CameraSpec:
-        """Returns the data sheet of a camera like this one that measures depth exactly at any distance and has exact
-        colours."""
+        """Returns the data sheet of a camera like this one that measures depth exactly at any distance, has exact
+        colours, and is in focus everywhere."""
         number = msgspec.structs.replace
         near = number(self.nearest, value=0.0)
         far = number(self.farthest, value=1000.0)
-        return msgspec.structs.replace(self, nearest=near, farthest=far, stereo=None, colour=None)
+        return msgspec.structs.replace(self, nearest=near, farthest=far, stereo=None, colour=None, lens=None)
 
     def info(self, frame_id: str, scale: float = 1.0, size: tuple[int, int] | None = None) -> CameraInfo:
         """Returns the intrinsics, with the principal point in the middle of the picture.
@@ -367,7 +373,8 @@ class Camera:
         """
         radiance = self._exposure.radiance
         exposure = response.meter(radiance, time, self._sunlight.brightness)
-        light = response.light(radiance, exposure)
+        developed = functools.partial(self._light, response, exposure, self._focus())
+        light = developed()
         if motion is not None:
             spec = response.spec
             exposure_time, delay = (0.0 if n is None else n.value for n in (spec.exposure_time, spec.line_delay))
@@ -381,7 +388,7 @@ class Camera:
                 if motion.pose_scene is not None:
                     motion.pose_scene(offset)
                 self._draw(primitives, motion.pose_at(pose, offset), time + offset)
-                light += share[k] * response.light(radiance, exposure)
+                light += share[k] * developed()
                 rows = np.flatnonzero(moments.nearest == k)
                 for kept, drawn in ((labels, self.rasterizer.labels), (exact, self.rasterizer.depth)):
                     if kept.size and len(rows):
@@ -390,6 +397,28 @@ class Camera:
                 motion.pose_scene(0.0)
         rng = spec_file.noise_rng(self.seed + 3, self.name, self.image_index)
         return response.develop(light, exposure, self._sunlight.balance, rng)
+
+    def _focus(self) -> float:
+        """Returns the distance [m] of the plane of focus for the depths that were drawn last; 0 without a lens."""
+        lens = self.spec.lens
+        if lens is None:
+            return 0.0
+        if lens.focus is not None:
+            return lens.focus.value
+        return automatic_focus(self.rasterizer.depth.numpy().reshape(self._drawn.height, self._drawn.width))
+
+    def _light(self, response: Response, exposure: float, focus: float) -> np.ndarray:
+        """Returns linear RGB [height, width, 3] of the radiance that was drawn last, blurred where it is out of
+        ``focus`` [m]."""
+        radiance = self._exposure.radiance
+        lens = self.spec.lens
+        if lens is None:
+            return response.light(radiance, exposure)
+        fine = self._supersampled
+        shape = (fine.height, fine.width)
+        disc = lens.infinity_disc(self._drawn.fx, self._drawn.width, focus)
+        clipped = np.minimum(radiance.numpy().reshape(*shape, 3), response.most_light(exposure))
+        return defocused(clipped, fine.depth.numpy().reshape(shape), self._quality.samples, disc, focus)
 
     def _download(self, *arrays: wp.array | None) -> list[np.ndarray]:
         """Copy device arrays to the host, with an empty array for None. A GPU copies all of them at once, through

@@ -25,6 +25,8 @@ from vinesim.sensors.camera import exposure as automatic
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 """Weights of linear red, green and blue in luminance (IEC 61966-2-1)."""
+SHARPENED_SIGMA = 1.0
+"""Standard deviation [px] of the filter of :attr:`ColourSpec.sharpening`: GUESSED."""
 _NOISE_NUMBERS = 1 << 18
 """Number of normal numbers from which the noise of all pictures is taken; each row starts at a random one."""
 _MOST_LIGHT = 4.0
@@ -72,6 +74,9 @@ class ColourSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """Standard deviation of the noise of the read-out."""
     chroma: Annotated[spec_file.Numbers, "px", (1.0, 2.0)]
     """Pixels across and down that share one chroma sample: [1, 1] is 4:4:4, [2, 1] 4:2:2, [2, 2] 4:2:0."""
+    sharpening: Annotated[Number | None, "1", (0.0, 3.0)] = None
+    """Strength of the sharpening by the image processor, or by scaling: the factor on what a Gaussian filter of
+    :data:`SHARPENED_SIGMA` takes away, on 8-bit levels. None: no sharpening."""
     jpeg: Annotated[Number | None, "1", (1.0, 100.0)] = None
     """Quality of the camera's JPEG files; None: the camera delivers uncompressed pictures."""
     exposure_time: Annotated[Number | None, "s", (0.0, 10.0)] = None
@@ -166,6 +171,10 @@ class Response:
         """Returns the exposure for ``radiance`` [sample] at simulated ``time`` [s]; ``brightness``: of the daylight."""
         return float(self._meter.update(radiance, time, brightness).numpy()[0])
 
+    def most_light(self, exposure: float) -> float:
+        """Returns the radiance that the light of one sample counts as at most, so that edges of lights are smooth."""
+        return _MOST_LIGHT * self.spec.white.value / max(exposure, 1e-9)
+
     def light(self, radiance: wp.array, exposure: float) -> np.ndarray:
         """Returns linear RGB [height, width, 3] of the pixels, before the lens blurs it. The array may be that of
         ``radiance`` [sample].
@@ -174,7 +183,7 @@ class Response:
         """
         source = radiance
         if self.samples > 1 or self.device != "cpu":
-            most = _MOST_LIGHT * self.spec.white.value / max(exposure, 1e-9)
+            most = self.most_light(exposure)
             wp.launch(
                 colour_response.average_samples,
                 self.width * self.height,
@@ -212,11 +221,20 @@ class Response:
             )
 
         self._workers.share([functools.partial(respond, *ends) for ends in itertools.pairwise(rows)])
-        return self._rgb.numpy().reshape(self.height, self.width, 3)
+        rgb = self._rgb.numpy().reshape(self.height, self.width, 3)
+        strength = self.spec.sharpening.value if self.spec.sharpening is not None else 0.0
+        return sharpened(rgb, strength) if strength > 0.0 else rgb
 
     def compress(self, rgb: np.ndarray) -> np.ndarray:
         """Returns ``rgb`` [height, width, 3] as the camera delivers it: with its chroma subsampling, and after JPEG."""
         return compressed(rgb, self.spec.subsampling, self.spec.jpeg and round(self.spec.jpeg.value))
+
+
+def sharpened(rgb: np.ndarray, strength: float) -> np.ndarray:
+    """Returns the 8-bit picture ``rgb`` [height, width, 3] with ``strength`` times its fine detail added (an unsharp
+    mask)."""
+    smooth = cv2.GaussianBlur(rgb, (0, 0), SHARPENED_SIGMA, borderType=cv2.BORDER_REPLICATE)
+    return cv2.addWeighted(rgb, 1.0 + strength, smooth, -strength, 0.0)
 
 
 def compressed(rgb: np.ndarray, subsampling: tuple[int, ...], quality: int | None) -> np.ndarray:

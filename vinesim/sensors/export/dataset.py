@@ -35,7 +35,7 @@ from vinesim.sensors.export import annotations as formats
 from vinesim.sensors.export import images as picture
 from vinesim.sensors.export.dormant_views import node_records, view_of_node
 from vinesim.sensors.export.files import remove_partial_files, write_files
-from vinesim.sensors.export.mix import LoadedMix, draw_entry, draw_number, draw_sun
+from vinesim.sensors.export.mix import LoadedMix, ViewEntry, draw_entry, draw_number, draw_sun
 from vinesim.sensors.export.views import Drive, ViewFinder
 from vinesim.sensors.ground_truth import PixelBuffers
 from vinesim.sensors.primitives.bunch_primitives import Ripeness
@@ -46,6 +46,8 @@ from vinesim.sensors.spec_file import SensorError
 
 IMAGES_PER_VINEYARD = 5
 """Number of images that are rendered of one vineyard, before the next vineyard is generated."""
+PICKED_SHARE = 0.5
+"""Share of the pictures without bunches in which all bunches are picked; the others look past the bunches."""
 MIN_IMAGE_SIZE = 16
 MAX_IMAGE_SIZE = 4096
 """Largest width and height of pictures [px]; ``MIN_IMAGE_SIZE`` is the smallest."""
@@ -321,7 +323,7 @@ class VineyardRenderer:
         if self.is_dormant:
             seen, values = view_of_node(finder, rng, view, info)
         elif is_negative:
-            seen, values = finder.without_bunches(rng, view, info)
+            snapshot, seen, values = self._without_bunches(rng, finder, view, info)
         else:
             places = [(one["x"], one["y"]) for one in activity.get("actors", [])]
             seen, values = finder.of_bunch(rng, view, info, places)
@@ -331,6 +333,24 @@ class VineyardRenderer:
             "view": {"name": view.name, "camera": entry.camera, "zoom": zoom, **values},
         }
         return _Shot(image, snapshot, activity, spec, seen, record)
+
+    def _without_bunches(
+        self, rng: np.random.Generator, finder: ViewFinder, view: ViewEntry, info: CameraInfo
+    ) -> tuple[Snapshot, PixelBuffers, dict[str, Any]]:
+        """Returns the state of the vineyard, a view of it in which no bunch is visible, and the drawn values.
+
+        In :data:`PICKED_SHARE` of the pictures all bunches are picked. Such a picture shows what others show but for
+        the bunches.
+        """
+        snapshot = finder.snapshot
+        if rng.random() < PICKED_SHARE:
+            picked = dataclasses.replace(snapshot, bunch_attached=np.zeros_like(snapshot.bunch_attached))
+            self.primitives.update(picked)
+            found = dataclasses.replace(finder, snapshot=picked).of_picked(rng, view, info, snapshot.bunch_attached)
+            if found is not None:
+                return picked, *found
+            self.primitives.update(snapshot)
+        return snapshot, *finder.without_bunches(rng, view, info)
 
     def _render(self, shot: _Shot) -> _Files:
         """Render a shot, to whose state the primitives are posed."""

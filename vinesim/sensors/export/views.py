@@ -32,6 +32,14 @@ MIN_ACTOR_SHARE = 0.01
 """Least share of a picture's pixels that show actors or boxes, in scenes that have any."""
 MIN_PLANT_SHARE = 0.02
 """Least share of the pixels of a picture without bunches that show a plant."""
+SUBJECT_ORGANS = {"leaves": (Organ.LEAF,), "wood": (Organ.TRUNK, Organ.ARM)}
+"""Organs of the primitives that are in the middle of pictures without bunches, by their subject."""
+SUBJECT_PITCH = {"leaves": (-0.3, 0.5), "wood": (-0.6, 0.3), "ground": (-1.3, -0.4)}
+"""Least and greatest angle [rad] by which the camera looks up at each subject."""
+SUBJECTS = (*SUBJECT_PITCH, "any")
+"""Subjects of pictures without bunches, besides places where bunches were picked."""
+_SUBJECT_REACH = 8.0
+"""Largest horizontal distance [m] of a subject from a bunch."""
 BUNCHES_PER_DRAW = 10
 """Number of bunches that are tried with the same drawn values, so that the views are distributed as the mix says."""
 _PREVIEW_WIDTH = 160
@@ -41,6 +49,7 @@ _DRAWS_PER_TRY = 20
 _TRIES_WITH_ACTORS = 30
 _TRIES_WITH_ALL_BUNCHES = 60
 _TRIES_WITHOUT_BUNCHES = 300
+_TRIES_OF_SUBJECT = 60
 _TRIES_UNTIL_DOWN = 60
 
 
@@ -139,11 +148,42 @@ class ViewFinder:
             "pictures; widen the ranges of the mix"
         )
 
+    def of_picked(
+        self, rng: np.random.Generator, entry: ViewEntry, info: CameraInfo, was_attached: np.ndarray
+    ) -> tuple[PixelBuffers, dict[str, Any]] | None:
+        """Returns a view as :meth:`of_bunch`, of a place where a bunch hung before all were picked, and the drawn
+        values; None if no view of a plant without bunches was found.
+
+        ``was_attached``: [bunch] whether each bunch hung there. The primitives must be posed to a snapshot in which
+        none of them hangs.
+        """
+        bunches = np.flatnonzero(was_attached)
+        tries = 0
+        values: dict[str, float] = {}
+        for draw in range(_TRIES_OF_SUBJECT * _DRAWS_PER_TRY):
+            if draw % BUNCHES_PER_DRAW == 0:
+                values = _draw_values(rng, entry)
+            bunch = int(bunches[rng.integers(len(bunches))])
+            side = 1.0 if rng.random() < 0.5 else -1.0
+            pose, _, distance = self._place(self._middle_of_bunch(bunch), bunch, side, values, info)
+            if not self._is_free(pose, entry, distance):
+                continue
+            tries += 1
+            if (seen := self._plants_alone(pose, info)) is not None:
+                return seen, {"subject": "picked", "side": side, "distance": distance, **values}
+            if tries == _TRIES_OF_SUBJECT:
+                break
+        return None
+
     def without_bunches(
         self, rng: np.random.Generator, entry: ViewEntry, info: CameraInfo
     ) -> tuple[PixelBuffers, dict[str, Any]]:
-        """Returns a view from a free place near a random hanging bunch, in a direction in which a plant is visible, but
-        no bunch; and the drawn values."""
+        """Returns a view without bunches in which a plant is visible, and the drawn values: a close view of leaves, of
+        wood or of the ground, or a view from a free place near a random hanging bunch in any direction."""
+        subject = SUBJECTS[int(rng.integers(len(SUBJECTS)))]
+        found = self._of_subject(rng, entry, info, subject) if subject in SUBJECT_PITCH else None
+        if found is not None:
+            return found
         hanging = self._hanging_bunches()
         for attempt in range(_TRIES_WITHOUT_BUNCHES):
             middle = self._middle_of_bunch(int(hanging[rng.integers(len(hanging))]))
@@ -155,19 +195,56 @@ class ViewFinder:
             pitch = rng.uniform(-0.3, 0.3) - 0.9 * min(attempt / _TRIES_UNTIL_DOWN, 1.0)
             roll = draw_number(rng, entry.roll)
             pose = _pose(eye, heading, pitch, roll)
-            if not self._is_way_free(pose):
-                continue
-            seen = ground_truth.render_buffers(self.primitives, info, pose)
-            if _is_obstructed(seen.depth):
-                continue
-            organs = seen.labels // LABEL_STRIDE
-            is_plant = (organs >= Organ.TRUNK) & (organs <= Organ.LEAF)
-            if not (organs == Organ.BUNCH).any() and is_plant.mean() >= MIN_PLANT_SHARE:
-                return seen, {"pitch": pitch, "roll": roll}
+            if self._is_way_free(pose) and (seen := self._plants_alone(pose, info)) is not None:
+                return seen, {"subject": "any", "pitch": pitch, "roll": roll}
         raise ViewError(
             f"scene {self.name!r} has no view of a plant without bunches, in {_TRIES_WITHOUT_BUNCHES} tries; "
             "lower fruit.bunches, or give --negatives 0"
         )
+
+    def _of_subject(
+        self, rng: np.random.Generator, entry: ViewEntry, info: CameraInfo, subject: str
+    ) -> tuple[PixelBuffers, dict[str, Any]] | None:
+        """Returns a close view of the ``subject``, one of :data:`SUBJECTS`, without bunches; None if there is none."""
+        terrain = self.primitives.model.terrain
+        places = self._subject_places(subject)
+        if not len(places):
+            return None
+        least, most = SUBJECT_PITCH[subject]
+        for _ in range(_TRIES_OF_SUBJECT):
+            target = places[rng.integers(len(places))]
+            heading, pitch, roll = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(least, most), draw_number(rng, entry.roll)
+            away = draw_number(rng, entry.distance)
+            pose = _pose(target, heading, pitch, roll)
+            pose[:3] -= frames.rotate(pose[3:], np.array([0.0, 0.0, away]))
+            height = pose[2] - ground_height(terrain, *pose[:2])
+            if not entry.camera_height[0] <= height <= entry.camera_height[1] or not self._is_way_free(pose):
+                continue
+            if (seen := self._plants_alone(pose, info)) is not None:
+                return seen, {"subject": subject, "pitch": pitch, "roll": roll, "distance": away}
+        return None
+
+    def _subject_places(self, subject: str) -> np.ndarray:
+        """Returns places [n, 3] m of a subject near bunches."""
+        around = self._middle_of_bunch(int(self._hanging_bunches()[0]))
+        if subject == "ground":
+            steps = np.arange(-_SUBJECT_REACH, _SUBJECT_REACH, 0.5)
+            x, y = (grid.ravel() for grid in np.meshgrid(around[0] + steps, around[1] + steps))
+            places = np.stack([x, y, np.zeros(x.size)], 1)
+            places[:, 2] += ground_height(self.primitives.model.terrain, x, y)
+        else:
+            is_subject = np.isin(self.primitives.organ, SUBJECT_ORGANS[subject])
+            places = self.primitives.shapes.a.numpy()[is_subject, :3].astype(float)
+        return places[np.linalg.norm(places[:, :2] - around[:2], axis=1) < _SUBJECT_REACH]
+
+    def _plants_alone(self, pose: np.ndarray, info: CameraInfo) -> PixelBuffers | None:
+        """Returns what a camera at ``pose`` [7] sees if that is a plant, no bunch, and nothing too near; else None."""
+        seen = ground_truth.render_buffers(self.primitives, info, pose)
+        organs = seen.labels // LABEL_STRIDE
+        is_plant = (organs >= Organ.TRUNK) & (organs <= Organ.LEAF)
+        if _is_obstructed(seen.depth) or (organs == Organ.BUNCH).any() or is_plant.mean() < MIN_PLANT_SHARE:
+            return None
+        return seen
 
     def _hanging_bunches(self) -> np.ndarray:
         """Returns the indices of the hanging bunches; if possible only of those around the point :attr:`near`."""
