@@ -8,7 +8,7 @@ import pytest
 from vinesim.client.client import Client
 from vinesim.client.tasks import start_poses
 from vinesim.client.tasks.motions import DriveTo, LookAt
-from vinesim.client.tasks.planning import UnknownTask, plan_task
+from vinesim.client.tasks.registry import UnknownTask, plan_task
 from vinesim.client.tasks.ros_command_handler import MAX_LOGGED, RosCommandHandler
 from vinesim.core import frames
 from vinesim.net.transport.memory_bus import MemoryHub

@@ -14,7 +14,7 @@ from vinesim.client.client import Client
 from vinesim.client.processes.robot_processes import RobotProcesses
 from vinesim.client.recording.state_digest import StateDigest
 from vinesim.client.tasks.motions import DriveTo, LookAt
-from vinesim.client.tasks.planning import plan_task, validate_task_name
+from vinesim.client.tasks.registry import plan_task, validate_task_name
 from vinesim.client.tasks.start_poses import start_pose, validate_bunch
 from vinesim.core.errors import UsageError, writing
 from vinesim.net.transport.bus import Bus

@@ -12,7 +12,8 @@ from vinesim.cli.demo.placement import check_device, visitor_pose
 from vinesim.cli.demo.progress import PICKER, VISITOR, Statuses, show_progress
 from vinesim.cli.demo.summary import job_summary, write_summary
 from vinesim.client.programs import START_TIMEOUT, program_group
-from vinesim.client.tasks.planning import UnknownTask, plan_meeting
+from vinesim.client.tasks.planning import plan_meeting
+from vinesim.client.tasks.registry import UnknownTask
 from vinesim.client.tasks.start_poses import bunch_centres, start_pose
 from vinesim.core.errors import writing
 from vinesim.robot.description.loader import load_description

@@ -1,0 +1,59 @@
+"""The tasks of a robot client by name. They are planned before the start and begin when physics and robot exist."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+
+import numpy as np
+
+from vinesim.client.tasks.harvesting import Candidates, HarvestByTruth, HarvestOptions
+from vinesim.client.tasks.planning import fill_box, plan_meeting, plan_swap
+from vinesim.client.tasks.start_poses import PlacementError
+from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.robot.tasks.meet_person import MeetPerson
+from vinesim.robot.tasks.swap_boxes import SwapBoxes, SwapPlan
+from vinesim.robot.tasks.task import Task
+from vinesim.scene.model import Model
+from vinesim.world import Physics
+
+TASKS = ("pick", "exchange", "meet")
+"""Names of the tasks that :func:`plan_task` plans."""
+
+
+class UnknownTask(ValueError):
+    """Error: no task has the given name. The message lists all tasks."""
+
+
+def validate_task_name(job: str | None) -> str | None:
+    """Returns the name ``job``, or None. Raises :class:`UnknownTask` if there is no such task."""
+    if job is not None and job not in TASKS:
+        raise UnknownTask(f"no job {job!r}; give {', '.join(TASKS[:-1])} or {TASKS[-1]}")
+    return job
+
+
+def plan_task(
+    job: str, model: Model, near: np.ndarray, harvest: HarvestOptions | None = None
+) -> tuple[Callable[[Physics, Robot], Task], np.ndarray]:
+    """Plan a task. Returns a function that begins it, and the pose [7] at which the robot must start.
+
+    ``near`` [7]: usual start pose of the robot. ``harvest``: which bunches are picked; one, unless given. It takes 1 to 2 s, too long for the real-time loop. Raises
+    :class:`UnknownTask`, and :class:`PlacementError` if the scene has no room for the task.
+    """
+    if validate_task_name(job) == "pick":
+        options = harvest or HarvestOptions()
+        candidates = Candidates.of_model(model, near[:2])
+        plan = candidates.next_plan(near[:2], set(), options, 0)
+        if plan is None:
+            raise PlacementError("no bunch hangs where a robot reaches it and drives to a box; choose another seed")
+        return functools.partial(HarvestByTruth, options=options, candidates=candidates), plan.base_pose
+    if job == "meet":
+        return functools.partial(MeetPerson, plan=plan_meeting(model, near)), near
+    boxes = plan_swap(model, near)
+    return functools.partial(_begin_swap, swap=boxes), near
+
+
+def _begin_swap(physics: Physics, robot: Robot, swap: SwapPlan) -> SwapBoxes:
+    """Fill the box that must be full, and begin the exchange."""
+    fill_box(physics, swap.full_box)
+    return SwapBoxes(physics, robot, swap)
