@@ -173,18 +173,34 @@ class PickBunch(Task):
         phase, once per step."""
         ahead = frames.rotate(self._base_pose()[3:], np.array([1.0, 0.0, 0.0]))
         self.arm.reset()
+        yield from self._reach_and_cut(ahead)
+        yield from self._draw_back(ahead)
+        yield from self._carry()
+
+    def _reach_and_cut(self, ahead: np.ndarray) -> Iterator[str]:
+        """Open the hand, bring it before the bunch, and grasp and cut the bunch."""
         self.robot.command_gripper(self.arm.gripper, 2.0 * (self._radius + OPENING_MARGIN))
         yield from self._move_hand(
             "reach", lambda: self._grasp_point() - APPROACH_DISTANCE * ahead, ahead, timeout=12.0
         )
+        yield from self._advance_and_cut(ahead)
+
+    def _advance_and_cut(self, ahead: np.ndarray) -> Iterator[str]:
+        """Advance around the bunch, close the fingers and cut the stalk."""
         yield from self._move_hand("advance", self._grasp_point, ahead, speed=0.10, timeout=8.0, near=0.003)
         yield from self._close_gripper(ahead)
         yield from self._cut()
+
+    def _draw_back(self, ahead: np.ndarray) -> Iterator[str]:
+        """Draw the bunch back from the plant and to the body."""
         back = self.arm.tip_position - APPROACH_DISTANCE * ahead + [0.0, 0.0, -0.03]
         yield from self._move_hand("back", lambda: back, ahead, speed=0.15, timeout=6.0)
         yield from self._move_hand(
             "tuck", lambda: self._base_to_world(CARRY_POSITION), ahead, speed=CARRY_SPEED, timeout=10.0, near=0.03
         )
+
+    def _carry(self) -> Iterator[str]:
+        """Drive to the box, put the bunch into it, and check that it is there."""
         yield from self._drive()
         yield from self._place_in_box()
         yield from self.wait(1.0, "rest")
