@@ -5,10 +5,12 @@ Each attempt has a vineyard of its own, and the robot's base stands where the ha
 attempt succeeds when the bunch has been cut, is in the hand and has been drawn back to the robot.
 
 ``--by truth``: planning and control use poses read from the simulation. Arm, hand, blade and canopy are tested,
-perception is not. ``--by cameras``: the robot looks around from places within reach with its head camera (the pictures
-are taken there without driving), finds bunches, chooses where to stand, looks again from there, picks, and checks by the
-camera whether the bunch is in its hand. It knows its base and joints, its forces, and the trellis. Whether it has picked
-is counted by the truth. ``--record FILE`` keeps a line of JSON for each seed, so that a long run can be continued.
+perception is not. ``--by cameras``: the robot looks around from places within reach with its head camera (the
+pictures are taken there without driving), finds bunches, chooses where to stand, looks again from there, picks, and
+checks by the camera whether the bunch is in its hand. It knows its base and joints, its forces, and the trellis. Whether
+it has picked is counted by the truth.
+
+``--record FILE`` keeps a line of JSON for each seed, so that a long run can be continued.
 """
 
 from __future__ import annotations
@@ -69,8 +71,8 @@ def class_name(clearance: float) -> str:
 def picking(
     by: str, seeds: Sequence[int], record: pathlib.Path | None, announce: Callable[[str], None]
 ) -> Iterator[Measurement]:
-    """Measure success over all bunches in reach, by clearance; seconds of a pick; causes of failures; other bunches that
-    came off."""
+    """Measure success over all bunches in reach, by clearance; seconds of a pick; causes of failures; other bunches
+    that came off."""
     known = {} if record is None or not record.exists() else _read(record)
     lines = []
     for seed in seeds:

@@ -21,9 +21,21 @@ def demo(
     seconds: Annotated[
         float | None,
         typer.Option(
-            min=6.0, help="Time that the robots push [s], by default 20; or time limit of a task, by default 120."
+            min=6.0,
+            help="Time that the robots push [s], by default 20; or time limit of a task, by default 120, and more for "
+            "more than one bunch.",
         ),
     ] = None,
+    bunches: Annotated[
+        int,
+        typer.Option(min=0, help="pick: number of bunches for one crate; 0: until it is full or none is left."),
+    ] = 1,
+    order: Annotated[
+        str, typer.Option(help="pick: freest, the bunch with most room for the hand first, or nearest.")
+    ] = "freest",
+    see: Annotated[
+        bool, typer.Option("--see", help="pick: find bunches by the robot's own camera, not by the simulation.")
+    ] = False,
     seed: Seed = None,
     scene: Annotated[
         str | None,
@@ -54,6 +66,8 @@ def demo(
       vinesim demo --scene my-block.toml --robot my-robot.urdf --headless
       vinesim demo --real-time-factor 0.5
       vinesim demo --job pick --seed 5
+      vinesim demo --job pick --bunches 0 --order nearest
+      vinesim demo --job pick --see
       vinesim demo --job exchange
       vinesim demo --job meet
     """
@@ -72,9 +86,12 @@ def demo(
         )
     else:
         from vinesim.cli.demo.task_demo import run_job
+        from vinesim.client.tasks.harvesting import HarvestOptions
 
         code = run_job(
             job,
+            harvest=HarvestOptions.named(bunches, order),
+            see=see,
             seconds=seconds,
             seed=seed,
             scene=scene,

@@ -20,6 +20,7 @@ from vinesim.client.tasks import planning
 from vinesim.client.tasks.planning import BoxApproach
 from vinesim.client.tasks.start_poses import PlacementError
 from vinesim.core import frames
+from vinesim.core.errors import UsageError
 from vinesim.robot.control.waypoint_follower import WaypointFollower
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.pick import PickBunch, PickPlan
@@ -36,6 +37,9 @@ SECONDS_PER_BUNCH = 90.0
 
 BOX_PHASES = frozenset({"over", "turn", "lower", "let go", "rise", "rest"})
 """Phases of a pick in which the base stands beside the crate."""
+
+
+NO_BOX = f"no box of this scene has {planning.BASE_CLEARANCE} m of room beside it for a robot; place one in an alley"
 
 
 class PickOrder(enum.StrEnum):
@@ -56,6 +60,15 @@ class HarvestOptions:
     order: PickOrder = PickOrder.FREEST
     tries: int = 2
     """Number of times that a bunch is tried."""
+
+    @classmethod
+    def named(cls, bunches: int, order: str) -> HarvestOptions:
+        """Returns the options with an order by its name. Raises :class:`UsageError` if there is no such order."""
+        if order not in set(PickOrder):
+            raise UsageError(f"no order {order!r}; give {' or '.join(PickOrder)}")
+        if bunches < 0:
+            raise UsageError(f"bunches is {bunches}; give the number to pick, or 0 for all")
+        return cls(bunches, PickOrder(order))
 
     @property
     def most(self) -> int:
@@ -252,10 +265,7 @@ class Candidates:
         if box is not None:
             self._approaches = [one for one in self._approaches if one.box == box]
         if not self._approaches:
-            raise PlacementError(
-                f"no box of this scene has {planning.BASE_CLEARANCE} m of room beside it for a robot; place one in an "
-                "alley"
-            )
+            raise PlacementError(NO_BOX)
         if box is None:
             box = min(self._approaches, key=lambda one: float(np.linalg.norm(one.place - near))).box
         self.box = box

@@ -7,11 +7,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vinesim.client.tasks.harvesting import Candidates, HarvestByTruth, HarvestOptions
-from vinesim.client.tasks.planning import fill_box, plan_meeting, plan_swap
+from vinesim.client.tasks.harvesting import NO_BOX, Candidates, HarvestByTruth, HarvestOptions
+from vinesim.client.tasks.planning import box_approaches, fill_box, plan_meeting, plan_swap
+from vinesim.client.tasks.seen_harvest import HarvestBySight
 from vinesim.client.tasks.start_poses import PlacementError
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.meet_person import MeetPerson
+from vinesim.robot.tasks.sight import Eyes
 from vinesim.robot.tasks.swap_boxes import SwapBoxes, SwapPlan
 from vinesim.robot.tasks.task import Task
 from vinesim.scene.model import Model
@@ -33,15 +35,25 @@ def validate_task_name(job: str | None) -> str | None:
 
 
 def plan_task(
-    job: str, model: Model, near: np.ndarray, harvest: HarvestOptions | None = None
+    job: str,
+    model: Model,
+    near: np.ndarray,
+    harvest: HarvestOptions | None = None,
+    eyes: Callable[[Physics, Robot], Eyes] | None = None,
 ) -> tuple[Callable[[Physics, Robot], Task], np.ndarray]:
     """Plan a task. Returns a function that begins it, and the pose [7] at which the robot must start.
 
-    ``near`` [7]: usual start pose of the robot. ``harvest``: which bunches are picked; one, unless given. It takes 1 to 2 s, too long for the real-time loop. Raises
-    :class:`UnknownTask`, and :class:`PlacementError` if the scene has no room for the task.
+    ``near`` [7]: usual start pose of the robot. ``harvest``: which bunches are picked; one, unless given. ``eyes``:
+    makes the eyes of a robot that picks by sight; without it, it picks by poses of the simulation. Planning takes 1 to
+    2 s, too long for the real-time loop. Raises :class:`UnknownTask`, and :class:`PlacementError` if the scene has no
+    room for the task.
     """
     if validate_task_name(job) == "pick":
         options = harvest or HarvestOptions()
+        if eyes is not None:
+            if next(box_approaches(model), None) is None:
+                raise PlacementError(NO_BOX)
+            return functools.partial(_begin_harvest_by_sight, options=options, near=near[:2], eyes=eyes), near
         candidates = Candidates.of_model(model, near[:2])
         plan = candidates.next_plan(near[:2], set(), options, 0)
         if plan is None:
@@ -51,6 +63,12 @@ def plan_task(
         return functools.partial(MeetPerson, plan=plan_meeting(model, near)), near
     boxes = plan_swap(model, near)
     return functools.partial(_begin_swap, swap=boxes), near
+
+
+def _begin_harvest_by_sight(
+    physics: Physics, robot: Robot, options: HarvestOptions, near: np.ndarray, eyes: Callable[[Physics, Robot], Eyes]
+) -> HarvestBySight:
+    return HarvestBySight(physics, robot, options, near, eyes(physics, robot))
 
 
 def _begin_swap(physics: Physics, robot: Robot, swap: SwapPlan) -> SwapBoxes:

@@ -25,7 +25,7 @@ from vinesim.world import Physics
 
 SURVEY_REACH = 3.0
 """[m] Distance from the start within which the robot looks for bunches and picks."""
-SURVEY_SPACING = 1.5
+SURVEY_SPACING = 1.1
 """[m] Distance between the places from which it looks."""
 GAZES = (-1.2, -0.4, 0.4, 1.2)
 """[rad] Directions of the head in which it looks at each place, to either side of the base."""
@@ -33,6 +33,8 @@ GAZE_HEIGHT = 1.72
 """[m] Height of the point at which it looks."""
 GAZE_DISTANCE = 1.2
 """[m] Distance of this point."""
+SURVEY_TIME = 600.0
+"""[s] Further time for looking around, in addition to that of :class:`HarvestOptions`."""
 MERGED = 0.09
 """[m] Horizontal distance below which two sights are of the same bunch: less than the width of one."""
 WOOD_RADIUS = 0.008
@@ -93,8 +95,8 @@ class Memory:
         return list(planning.grasp_poses(model, near, numbers, hold, length, self._obstacles(), -np.inf))
 
     def _obstacles(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns spheres around what a hand may not touch: centres [n, 3] m, radii [n] m, and the bunch of each [n], -1
-        for none."""
+        """Returns spheres around what a hand may not touch: centres [n, 3] m, radii [n] m, and the bunch of each [n],
+        -1 for none."""
         share = np.linspace(-0.8, 0.8, 5)
         fruit = [one.best.centre + 0.5 * one.best.length * share[:, None] * [0.0, 0.0, 1.0] for one in self.bunches]
         plump = [one.best.radius * np.sqrt(1.0 - share**2) for one in self.bunches]
@@ -152,6 +154,7 @@ class HarvestBySight(Harvest):
     def __init__(self, physics: Physics, robot: Robot, options: HarvestOptions, near: np.ndarray, eyes: Eyes) -> None:
         """``near`` [2] m: the start. ``eyes``: takes and analyses a picture."""
         super().__init__(physics, robot, options)
+        self.timeout += SURVEY_TIME
         self.memory = Memory()
         self._near = near
         self._eyes = eyes

@@ -285,9 +285,11 @@ class PickBunch(Task):
         for _ in self.wait(0.5, "withdraw"):
             self.arm.hold_position()
             yield "withdraw"
-        back = self.arm.tip_position - APPROACH_DISTANCE * ahead
-        for goal, near in ((lambda: back, 0.05), (lambda: self._base_to_world(CARRY_POSITION), 0.06)):
-            yield from self._move_hand("withdraw", goal, ahead, speed=CARRY_SPEED, timeout=8.0, near=near)
+        if self.phase in ("advance", "open", "close", "cut", "back"):
+            back = self.arm.tip_position - APPROACH_DISTANCE * ahead
+            yield from self._move_hand("withdraw", lambda: back, ahead, speed=CARRY_SPEED, timeout=8.0, near=0.05)
+        carry = lambda: self._base_to_world(CARRY_POSITION)  # noqa: E731
+        yield from self._move_hand("withdraw", carry, ahead, speed=CARRY_SPEED, timeout=10.0, near=0.06)
 
     def fold(self) -> Iterator[str]:
         """After the release: draw the hand to the body, so that the base can turn. Yields the phase ``"fold"``."""

@@ -30,37 +30,37 @@ LOST_STEPS = 20
 """Number of steps with less than :data:`HELD_FORCE` after which the bunch counts as lost."""
 SAME_BUNCH = 0.10
 """[m] Horizontal distance between two sights of the same bunch."""
-HELD_POINTS = 12
+HELD_POINTS = 30
 """Number of coarse points of fruit in the hand from which on the camera shows that the hand holds a bunch. TUNED"""
 POINTED = 0.06
 """[rad] Angle within which the camera points at what it is to look at. GUESSED"""
 LIFT_MARGIN = 0.02
 """[m] Distance of the lift from its upper end while the robot looks."""
+HELD_REACH = 0.09
+"""[m] Horizontal distance from the hand within which points count as in it."""
 LOOK_TIME = 3.0
 """[s] Time in which the head turns to what it is to look at."""
 
 
-def look(task: Task) -> Iterator[str]:
-    """Wait until the head camera points at the focus of a task, at most :data:`LOOK_TIME`, with the lift up. Yields the
-    phase ``"look"``, once per step. The head is turned by :class:`vinesim.client.tasks.motions.LookAt`."""
+def look(task: Task, *, use_lift: bool = True) -> Iterator[str]:
+    """Wait until the head camera points at the focus of a task, at most :data:`LOOK_TIME`. Yields the phase ``"look"``,
+    once per step. The head is turned by :class:`vinesim.client.tasks.motions.LookAt`.
+
+    ``use_lift``: raise the lift, as bunches hang high.
+    """
     robot = task.robot
-    lifts = (
-        robot.joint_indices(robot.description.groups["torso"].joints) if "torso" in robot.description.groups else None
-    )
-    if lifts is not None:
-        robot.command_position(robot.upper_limit[lifts] - LIFT_MARGIN, lifts)
+    torso = robot.description.groups.get("torso")
+    lifts = robot.joint_indices(torso.joints) if torso is not None and use_lift else np.zeros(0, int)
+    robot.command_position(robot.upper_limit[lifts] - LIFT_MARGIN, lifts)
     frame = robot.description.sensors_of(CameraMount.kind)[0].frame
-    start = end = task.time
-    while end - start < LOOK_TIME:
+    start = task.time
+    while task.time - start < LOOK_TIME:
+        yield "look"
         pose = robot.frame_pose(frame)
         axis = frames.rotate(pose[3:], np.array([0.0, 0.0, 1.0]))
-        is_up = (
-            lifts is None or np.abs(robot.setpoint[lifts] - robot.rigid.joint_state(robot.name)[0][lifts]).max() < 0.01
-        )
-        if end > start and is_up and axis @ frames.normalize(task.focus() - pose[:3]) > np.cos(POINTED):
+        below = robot.setpoint[lifts] - robot.rigid.joint_state(robot.name)[0][lifts]
+        if np.abs(below).max(initial=0.0) < 0.01 and axis @ frames.normalize(task.focus() - pose[:3]) > np.cos(POINTED):
             return
-        yield "look"
-        end = task.time
 
 
 class PickSeenBunch(PickBunch):
@@ -77,6 +77,8 @@ class PickSeenBunch(PickBunch):
         self._cut_force = 0.0
         self._steps_without_force = 0
         self._gaze: np.ndarray | None = None
+        self.points_in_hand = 0
+        """Number of coarse points of fruit in the hand after the cut."""
         self.was_in_hand = False
         """Whether the camera has shown the bunch in the hand after the cut."""
         super().__init__(physics, robot, plan, timeout=timeout)
@@ -179,14 +181,17 @@ class PickSeenBunch(PickBunch):
     def _see_hand(self) -> Iterator[str]:
         """Look at the hand, and raise :class:`TaskFailed` if no fruit is in it."""
         self._gaze = self.arm.tip_position
-        for phase in look(self):
+        for phase in look(self, use_lift=False):
             self.arm.hold_position()
             yield phase
         fruit = self._eyes().fruit
         off = fruit - self.arm.tip_position
-        inside = (np.linalg.norm(off[:, :2], axis=1) < 0.12) & (off[:, 2] > -self._length) & (off[:, 2] < 0.08)
+        inside = (np.linalg.norm(off[:, :2], axis=1) < HELD_REACH) & (
+            np.abs(off[:, 2] + 0.5 * self._length - self._grasp_depth) < 0.5 * self._length
+        )
         self._gaze = None
-        if np.count_nonzero(inside) < HELD_POINTS:
+        self.points_in_hand = int(np.count_nonzero(inside))
+        if self.points_in_hand < HELD_POINTS:
             raise TaskFailed("the camera shows no bunch in the hand")
         self.was_in_hand = True
 
