@@ -21,6 +21,7 @@ import numpy as np
 from vinesim.api.energy import Energy, Momentum, energy, momentum
 from vinesim.api.pusher import Pusher, checked_shape
 from vinesim.client.faults import FaultLog, occurred
+from vinesim.contact.bud_forces import bud_forces
 from vinesim.core import frames, progress
 from vinesim.core.errors import UsageError, checked_index
 from vinesim.core.numbers import as_numbers, checked_vector, is_number, is_whole
@@ -191,6 +192,13 @@ class Simulation:
         """Contacts of robots, boxes and people with plants in the last step, each with position [3] m and force [3]
         N."""
         return self.physics.contacts
+
+    @property
+    def bud_forces(self) -> np.ndarray:
+        """[bud] N, force on each bud of dormant canes in the last step: the sum of the magnitudes of the forces of
+        contacts at its place along the cane. The id of a bud is its index; :attr:`~vinesim.scene.model.Model.nodes`
+        tells where buds are."""
+        return bud_forces(self.model, self.state.body_q, self.contacts)
 
     @property
     def detachments(self) -> tuple[Detachment, ...]:

@@ -87,6 +87,8 @@ class Link:
     """[3] rad, angles at which the springs are slack."""
     capsules: tuple[Capsule, ...]
     leaves: tuple[Leaf, ...]
+    buds: tuple[tuple[str, np.ndarray], ...] = ()
+    """Name and pose [7] in the body's frame of each bud of a dormant cane, which points along x."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -251,6 +253,11 @@ def _links(
         half = float(model.leaf_size[at])
         pose = frames.compose(model.leaf_pose[at].astype(float), frames.pose(np.array([half, 0.0, 0.0])))
         blades.setdefault(int(model.leaf_body[at]), []).append(Leaf(pose, np.array([half, half, 5e-4])))
+    nodes = model.nodes
+    buds: dict[int, list[tuple[str, np.ndarray]]] = {}
+    for node in np.flatnonzero(nodes.bud >= 0).tolist():
+        one = f"bud_{int(nodes.bud[node]):05d}", nodes.bud_pose[node].astype(float)
+        buds.setdefault(int(nodes.body[node]), []).append(one)
     bunch = {int(body): i for i, body in enumerate(model.bunch_body)}
     made = []
     for body in bodies.tolist():
@@ -272,6 +279,7 @@ def _links(
                 rest=springs.rest[body],
                 capsules=tuple(capsules.get(body, ())),
                 leaves=tuple(blades.get(body, ())),
+                buds=tuple(buds.get(body, ())),
             )
         )
     return tuple(made)

@@ -148,6 +148,8 @@ def _add_links(world: _Element, vineyard: Vineyard) -> list[_Element]:
             add(body, "geom", class_=link.organ.name.lower(), **_shape(capsule))
         for leaf in link.leaves:
             add(body, "geom", class_="leaf", **_pose(leaf.pose), size=text(*leaf.size))
+        for name, pose in link.buds:
+            add(body, "site", name=name, **_pose(pose), size="0.003", group="4")
     return bodies
 
 

@@ -88,6 +88,9 @@ def _add_plant_link(root: _Element, link: Link, parent: str) -> None:
         _add_capsule(last, link.organ, capsule)
     for leaf in link.leaves:
         _add_shape(last, Organ.LEAF, _origin(leaf.pose), "box", collides=False, size=text(*(2.0 * leaf.size)))
+    for name, place in link.buds:
+        add(root, "link", name=name)
+        _add_joint(root, f"{name}_joint", "fixed", link.name, name, place)
 
 
 def _add_joint(root: _Element, name: str, kind: str, parent: str, child: str, pose: np.ndarray) -> _Element:

@@ -106,6 +106,8 @@ class _StageWriter:
             self._capsule(f"{path}/shape_{i}", link.organ, capsule)
         for i, leaf in enumerate(link.leaves):
             self._box(f"{path}/leaf_{i}", Organ.LEAF, leaf.pose, leaf.size, collides=False)
+        for name, place in link.buds:
+            self._place(pxr.UsdGeom.Xform.Define(self.stage, f"{path}/{name}"), place)
         frame = frames.from_matrix(link.axes.T)
         here = frames.pose(np.zeros(3), frame)
         joint = self._joint(f"{path}_joint", parent, frames.compose(link.pose, here), path, here)

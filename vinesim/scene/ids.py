@@ -25,6 +25,16 @@ class Organ(enum.IntEnum):
     BOX = 10
     ROBOT = 11
     HUMAN = 12
+    SPUR = 13
+    """Two-year wood of dormant vines: spurs and fruiting cane. In the physics its bodies are canes."""
+    NODE = 14
+    """Node (swelling) of dormant wood, without its bud; part of a cane in the physics."""
+    BUD = 15
+    """Bud of a dormant cane; part of the cane in the physics."""
+
+
+PARTS_OF_CANE = (Organ.SPUR, Organ.NODE, Organ.BUD)
+"""Classes of labels whose surface and substance are those of canes."""
 
 
 class ObjectKind(enum.IntEnum):

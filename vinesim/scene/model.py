@@ -21,6 +21,7 @@ from vinesim.core import frames
 from vinesim.core.array_fields import StructOfArrays, array
 from vinesim.scene.ids import Organ
 from vinesim.scene.look import Look
+from vinesim.scene.nodes import DormantCanes, Nodes, no_canes, no_nodes
 from vinesim.scene.terrain import Terrain
 
 _UNIT_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
@@ -147,16 +148,24 @@ class Model(StructOfArrays):
     """The uneven ground; None: the plane z = 0."""
     look: Look = dataclasses.field(default_factory=Look)
     """What sensors see and physics does not need. It is not part of the digest."""
+    nodes: Nodes = dataclasses.field(default_factory=no_nodes)
+    """Nodes and buds of dormant vines; empty in a vineyard without a dormant date."""
+    canes: DormantCanes = dataclasses.field(default_factory=no_canes)
+    """Canes of dormant vines; empty in a vineyard without a dormant date."""
 
     def copy(self) -> Model:
         """Returns a deep copy of the arrays, with the same terrain and look."""
-        return dataclasses.replace(super().copy(), terrain=self.terrain, look=self.look)
+        nodes, canes = self.nodes.copy(), self.canes.copy()
+        return dataclasses.replace(super().copy(), terrain=self.terrain, look=self.look, nodes=nodes, canes=canes)
 
     def digest(self) -> str:
         """Returns a hash of all arrays (16 hex digits): two clients with equal digests hold the same vineyard."""
         h = hashlib.blake2b(digest_size=8)
         for name in self.array_fields():
             h.update(np.ascontiguousarray(getattr(self, name)).tobytes())
+        for part in (self.nodes, self.canes):  # no bytes without dormant wood
+            for name in part.array_fields():
+                h.update(np.ascontiguousarray(getattr(part, name)).tobytes())
         if self.terrain is not None:
             h.update(repr((self.terrain.origin, self.terrain.cell, self.terrain.slope)).encode())
             h.update(self.terrain.residual.tobytes())

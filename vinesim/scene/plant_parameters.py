@@ -256,7 +256,7 @@ def load_plant(name: str) -> VineParameters:
     :class:`DataError` if the file cannot be used, for example because a unit is wrong."""
     path = find_data_file("plants", name, ".toml")
     vine = to_struct(_plant_tables(path), VineParameters, str(path))
-    _check_units(vine, str(path))
+    check_units(vine, str(path))
     for part in ("cane", "peduncle", "bunch", "rachis", "arm", "trunk"):
         _check_plausibility(getattr(vine, part), f"{path}: {part}")
     return vine
@@ -285,7 +285,7 @@ def load_varieties() -> tuple[Berry, ...]:
     path = find_data_file("plants", "varieties", ".toml")
     varieties = load_toml(path, Varieties).varieties
     for i, berry in enumerate(varieties):
-        _check_units(berry, f"{path}: varieties[{i}]")
+        check_units(berry, f"{path}: varieties[{i}]")
     return varieties
 
 
@@ -311,7 +311,7 @@ def load_specimen(path: str | pathlib.Path) -> Specimen:
 
 
 def _check_specimen(specimen: Specimen, path: str) -> None:
-    _check_units(specimen, f"{path}: specimen")
+    check_units(specimen, f"{path}: specimen")
     for name in ("length", "base_diameter", "tip_diameter", "modulus", "density", "damping", "tip_mass"):
         number = getattr(specimen, name)
         if number is not None and not number.value > 0.0:
@@ -353,13 +353,14 @@ def _check_axis(specimen: Specimen, path: str) -> None:
         )
 
 
-def _check_units(part: msgspec.Struct, place: str) -> None:
+def check_units(part: msgspec.Struct, place: str) -> None:
+    """Raise :class:`DataError` for the first number of ``part`` whose unit is not that of its field."""
     hints = typing.get_type_hints(type(part), include_extras=True)
     for name in part.__struct_fields__:
         value = getattr(part, name)
         unit = getattr(hints[name], "__metadata__", None)
         if isinstance(value, _Part):
-            _check_units(value, f"{place}: {name}" if ":" not in place else f"{place}.{name}")
+            check_units(value, f"{place}: {name}" if ":" not in place else f"{place}.{name}")
         elif unit and isinstance(value, Number | Range | Colour) and value.unit != unit[0]:
             joint = "." if ": " in place else ": "
             raise DataError(f"{place}{joint}{name}.unit is {value.unit!r}; give the value in {unit[0]!r}")

@@ -8,6 +8,7 @@ vine.
 
 from __future__ import annotations
 
+import datetime
 import math
 import pathlib
 from typing import Annotated, Literal
@@ -25,6 +26,7 @@ from vinesim.scene.berries import VARIETIES
 from vinesim.scene.palette import PaletteTable, resolve
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.plant_import.imported_plant import load_imported_plant
+from vinesim.scene.season import SeasonState, state_on
 
 MAX_ROBOTS = 10
 """Largest number of robots in one vineyard (CANOPIES D6.4 section 2.3)."""
@@ -114,6 +116,11 @@ class Season(_Part, frozen=True, kw_only=True):
     fruit_zone: Annotated[float, msgspec.Meta(ge=0.0, le=2.0)] = 0.35
     """[m] Distance from the base of its shoot within which a leaf is in the fruit zone; on upright shoots this is the
     height above the cordon. Hedges are pulled 0.3 to 0.4 m high (GUESSED from photographs)."""
+    temperatures: tuple[float, float, float, float, float, float, float, float, float, float, float, float] | None = (
+        None
+    )
+    """[degC] Mean temperature of each month, January to December, from which the stages of a scene with a date follow;
+    by default those of Latina in Italy, near Aprilia."""
 
 
 class Clutter(_Part, frozen=True, kw_only=True):
@@ -275,6 +282,12 @@ class Scene(_Part, frozen=True, kw_only=True):
     layout: Layout
     terrain: TerrainTable | None = None
     """Uneven ground; the plane z = 0 unless given."""
+    date: datetime.date | None = None
+    """Date, of which month and day count: shoots, leaves, berries and colours are those of that day, and in winter the
+    vines are bare canes with buds (:mod:`vinesim.scene.season`). Without a date the vines are those of harvest."""
+    pruning: Literal["spur", "cane"] = "spur"
+    """What pruning leaves of last year's canes, in a scene with a date: spurs of two buds on a cordon, or a cane on
+    either side of the trunk and a renewal spur."""
     season: Season = Season()
     clutter: Clutter = Clutter()
     palette: PaletteTable = PaletteTable()
@@ -356,13 +369,66 @@ def _find_error(scene: Scene) -> str:
             load_imported_plant(one.file)
         except DataError as bad:
             return f"imported[{i}].file: {bad}"
-    if trouble := _find_terrain_error(scene):
+    if trouble := _find_date_error(scene) or _find_terrain_error(scene):
         return trouble
     names = [s.name for s in scene.spawns]
     for i, name in enumerate(names):
         if name in names[:i]:
             return f"spawns[{i}].name is {name!r}, as spawns[{names.index(name)}].name; give each its own name"
     return ""
+
+
+def _find_date_error(scene: Scene) -> str:
+    """Check rules of the date that the types cannot express; see :func:`_find_error`."""
+    if scene.pruning == "cane" and scene.training != "vsp":
+        return 'pruning is "cane" and training is "tendone"; give training = "vsp", or pruning = "spur"'
+    if scene.date is None:
+        for key, given in (
+            ("pruning", scene.pruning != "spur"),
+            ("season.temperatures", scene.season.temperatures is not None),
+        ):
+            if given:
+                return f"{key} is given without date; add date = 2026-01-15, or remove {key}"
+        return ""
+    if scene.datum.latitude < 0.0:
+        return (
+            f"date is {scene.date} and datum.latitude is {scene.datum.latitude}; the curves are those of the north: "
+            "give the date half a year later and a latitude above 0, or remove date"
+        )
+    try:
+        season_of(scene)
+    except ValueError as bad:
+        return f"date is {scene.date}: {bad}"
+    return ""
+
+
+def season_of(scene: Scene) -> SeasonState | None:
+    """Returns the state of the scene's vines on its date; None without a date.
+
+    Raises :class:`ValueError` with one line if the vines do not flower or ripen with the scene's temperatures.
+    """
+    if scene.date is None:
+        return None
+    cane = plant_parameters.load_plant(scene.plants).cane
+    mean_shoot = float(cane.length.at(0.5)), float(cane.nodes.at(0.5))
+    return state_on(scene.date, scene.season.temperatures, mean_shoot)
+
+
+def on_its_date(scene: Scene) -> Scene:
+    """Returns the scene with leaves and fruit of its date: leafiness, share of yellow leaves, and ripeness unless the
+    scene gives one. Without a date the scene is returned unchanged."""
+    state = season_of(scene)
+    if state is None:
+        return scene
+    season = msgspec.structs.replace(
+        scene.season,
+        leafiness=scene.season.leafiness * state.shown,
+        yellow=1.0 - (1.0 - scene.season.yellow * state.woody) * (1.0 - state.yellow),
+    )
+    fruit = scene.fruit
+    if fruit.ripeness is None:
+        fruit = msgspec.structs.replace(fruit, ripeness=state.ripeness)
+    return msgspec.structs.replace(scene, season=season, fruit=fruit)
 
 
 MAX_NODES = 1_000_000

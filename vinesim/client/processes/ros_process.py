@@ -106,6 +106,8 @@ class RosProcess:
             tuple(mount.name for mount in description.wrenches),
             interest_radius,
             params_file,
+            cane_count=len(model.canes.body),
+            bud_count=int(model.nodes.bud.max(initial=-1)) + 1,
         )
         self._visuals: tuple[RigidVisual, ...] | None = None
         """All rigid bodies of the world when the list of bodies in the ground truth was made."""
@@ -296,6 +298,9 @@ class RosProcess:
             truth["time"][0] = physics.time + client.world_time.offset
             truth["attached"][:] = physics.state.bunch_attached
             truth["bunch_q"][:] = physics.state.body_q[self._model.bunch_body]
+            canes = self._model.canes.body
+            truth["dormant_q"][: len(canes)] = physics.state.body_q[canes]
+            truth["dormant_q"][len(canes) :] = self._model.nodes.bud_poses(physics.state.body_q)
             truth["version"][0] = self._truth_list.version
             self._truth_list.memory["visual_q"][: len(self._truth_rows)] = physics.visual_q()[self._truth_rows]
 

@@ -83,6 +83,10 @@ class RosConfig:
     parameters: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Values of the node's parameters that were set, by name. The client updates them, and each run starts with
     them."""
+    cane_count: int = 0
+    """Number of dormant canes, two-year wood included."""
+    bud_count: int = 0
+    """Number of buds of dormant canes."""
 
     @property
     def step_topics(self) -> tuple[str, ...]:
@@ -103,6 +107,7 @@ class RosChannel:
                 "time": ((1,), "f8"),
                 "attached": ((config.bunch_count,), "?"),
                 "bunch_q": ((config.bunch_count, 7), "f4"),
+                "dormant_q": ((config.cane_count + config.bud_count, 7), "f4"),  # canes, then buds
                 "version": ((1,), "i8"),  # of the list of rigid bodies
             },
             context,
@@ -168,6 +173,8 @@ class RosWorker(Worker):
         poles = tuple(f"pole_{i:04d}" for i in range(len(config.poles)))
         self.node.publish_environment_static(poles, config.poles)
         self._bunch_names = tuple(f"bunch_{i:05d}" for i in range(config.bunch_count))
+        canes = (f"cane_{i:05d}" for i in range(config.cane_count))
+        self._dormant_names = (*canes, *(f"bud_{i:05d}" for i in range(config.bud_count)))
         self._rigid = VisualListReceiver()
         self._truth_names: tuple[str, ...] = ()
         self._named: tuple[int, bytes] = 0, b""
@@ -246,7 +253,7 @@ class RosWorker(Worker):
             self.node.publish_sound(block.time + step.to_world, to_pcm(block.samples))
 
     def _publish_truth(self) -> None:
-        """Publish the true poses of rigid bodies, and of the bunches that are attached to their plants."""
+        """Publish the true poses of rigid bodies, of dormant canes and buds, and of the bunches that are attached to their plants."""
         with self.channel.truth.reading() as truth:
             version = int(truth["version"][0])
             memory = self._rigid.memory
@@ -255,11 +262,11 @@ class RosWorker(Worker):
             now = float(truth["time"][0])
             attached = np.flatnonzero(truth["attached"])
             rigid_q = memory["visual_q"][: len(self._rigid.visuals)]
-            poses = np.concatenate([rigid_q, truth["bunch_q"][attached]])
+            poses = np.concatenate([rigid_q, truth["bunch_q"][attached], truth["dormant_q"]])
         if (named := (version, attached.tobytes())) != self._named:
             rigid = map(truth_frame, self._rigid.visuals)
             self._named = named
-            self._truth_names = (*rigid, *(self._bunch_names[i] for i in attached))
+            self._truth_names = (*rigid, *(self._bunch_names[i] for i in attached), *self._dormant_names)
         self.node.publish_environment(now, self._truth_names, poses)
 
     def _report(self) -> None:

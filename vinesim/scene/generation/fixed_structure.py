@@ -11,7 +11,11 @@ from vinesim.scene.generation.gnarl import POST_RADIUS, gnarled_arms, gnarled_tr
 from vinesim.scene.generation.shoot_slots import ARM_SEGMENTS, TRUNK_SEGMENTS
 from vinesim.scene.ids import Organ
 from vinesim.scene.plant_parameters import VineParameters
+from vinesim.scene.season import load_season
 from vinesim.scene.spec import Scene
+
+_WIRE_GAP = 0.012
+"""[m] Depth of a fruiting cane's axis below its wire: it hangs in ties."""
 
 
 @dataclasses.dataclass
@@ -55,6 +59,8 @@ def build_fixed_structure(scene: Scene, parameters: VineParameters) -> FixedStru
     bend = np.stack([g.normal(size=(arm_count, ARM_SEGMENTS + 1, 3)) for g in rngs])
 
     head = layout.height - (0.06 if tendone else 0.03)
+    if scene.pruning == "cane":
+        head = layout.height - load_season().dormant.fruiting_cane_drop.value
     up = np.linspace(0.0, 1.0, TRUNK_SEGMENTS + 1)[:, None]
     beside = parameters.trunk.beside_pole.value
     side = np.array([0.0, beside, 0.0] if tendone else [beside, 0.0, 0.0])
@@ -74,11 +80,15 @@ def build_fixed_structure(scene: Scene, parameters: VineParameters) -> FixedStru
     thick = 0.5 * parameters.trunk.diameter.at(up[:, 0])
     thin = 0.5 * parameters.arm.diameter.at(along[:, 0])
     count = len(foot)
+    twists = scene.pruning == "spur"
+    if not twists:
+        arms, thin = _lay_down(scene, arms)
     arm_radius = np.broadcast_to(thin, arms.shape[:3])
     trunk_radius = np.broadcast_to(thick, trunk.shape[:2])
     if scene.clutter.old_wood > 0.0:
         trunk, trunk_radius = gnarled_trunks(scene, row, place, trunk, trunk_radius)
-        arms, arm_radius = gnarled_arms(scene, row, place, arms, arm_radius, trunk[:, -1])
+        if twists:
+            arms, arm_radius = gnarled_arms(scene, row, place, arms, arm_radius, trunk[:, -1])
     radius = np.full((len(pole), 2), 0.5 * parameters.trellis.pole_diameter.value)
     for kind, thickness in POST_RADIUS.items():
         radius[post_kinds(scene.clutter, scene.seed, pole_row) == kind] = thickness
@@ -89,7 +99,7 @@ def build_fixed_structure(scene: Scene, parameters: VineParameters) -> FixedStru
             arm_radius.reshape(-1, arms.shape[2]),
             Organ.ARM,
             np.arange(count * arm_count),
-            shear_modulus=builder.shear_modulus(parameters.cane.woody_modulus.value),
+            shear_modulus=builder.shear_modulus(parameters.cane.woody_modulus.value) if twists else 0.0,
         ),
         cone_chains(
             pole[:, None] + np.array([[0, 0, -0.3], [0, 0, layout.height + (0.1 if tendone else 1.15)]]),
@@ -101,6 +111,22 @@ def build_fixed_structure(scene: Scene, parameters: VineParameters) -> FixedStru
     ]
     fixed = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
     return FixedStructure(foot, row, place, rngs, arms, trunk, arm_radius, trunk_radius, fixed)
+
+
+def _lay_down(scene: Scene, arms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the points [vine, arm, point, 3] m and the radii [point] m of fruiting canes in place of ``arms``: they
+    rise from the head of the trunk to the fruiting wire and follow it. Ties keep them from twisting."""
+    dormant = load_season().dormant
+    share = np.linspace(0.0, 1.0, arms.shape[2])
+    low = np.maximum(1.0 - share / 0.3, 0.0)
+    arms = arms.copy()
+    top = scene.layout.height - _WIRE_GAP
+    arms[..., 2] = top - (top - arms[:, :, :1, 2]) * (low * low)
+    foot = arms[:, :, :1, :2]
+    sway = (arms[..., :2] - foot) - share[:, None] * (arms[:, :, -1:, :2] - foot)
+    arms[..., :2] -= 0.6 * sway  # the wire holds the cane straight
+    arms[..., 1] = foot[..., 1] + (arms[..., 1] - foot[..., 1]) * 0.3
+    return arms, 0.5 * dormant.fruiting_cane_diameter.at(share)
 
 
 def cone_chains(

@@ -71,10 +71,13 @@ def seat_on_spurs(scene: Scene, structure: FixedStructure, each: int) -> SpurSea
     return SpurSeats(np.concatenate(share), np.concatenate(offset))
 
 
-def with_old_wood(scene: Scene, structure: FixedStructure, start: np.ndarray) -> FixedStructure:
+def with_old_wood(
+    scene: Scene, structure: FixedStructure, start: np.ndarray, has_cordons: bool = True
+) -> FixedStructure:
     """Returns the structure with spur heads below the shoots, and with stubs and burls, at the end of its pieces.
 
-    ``start``: [shoot, 3] m, bases of the shoots, arm by arm. Without old wood the structure is returned unchanged. A
+    ``start``: [shoot, 3] m, bases of the shoots, arm by arm; ``has_cordons``: False for cane-pruned vines, whose trunks
+    alone are old. Without old wood the structure is returned unchanged. A
     stub was cut: its piece has the same radius at both ends. No other piece of wood has.
     """
     age = scene.clutter.old_wood
@@ -87,7 +90,7 @@ def with_old_wood(scene: Scene, structure: FixedStructure, start: np.ndarray) ->
     pieces = _Pieces()
     for vine in range(vines):
         g = rngs[vine]
-        for arm in range(count):
+        for arm in range(count if has_cordons else 0):
             axis = structure.arms[vine, arm]
             radius = structure.arm_radius[vine, arm]
             index = vine * count + arm

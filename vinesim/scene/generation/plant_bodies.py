@@ -83,7 +83,7 @@ def build_bodies(parameters: VineParameters, shoots: Shoots) -> Bodies:
     tip = 0.5 * cane.tip_diameter.value
     share = np.linspace(0.0, 1.0, AXIS_SEGMENTS + 1)
     radius = shoots.base[:, None] + (tip - shoots.base[:, None]) * share
-    green = np.clip((share[:-1] - cane.woody_share.value) / 0.2 + 0.5, 0.0, 1.0)
+    green = np.clip((share[:-1] - cane.woody_share.value * shoots.woody) / 0.2 + 0.5, 0.0, 1.0)
     woody = math.log(cane.woody_modulus.value)
     soft = math.log(cane.green_modulus.value)
     modulus = portable_math.exp(woody * (1.0 - green) + soft * green)
@@ -269,6 +269,7 @@ def place_leaves(scene: Scene, parameters: VineParameters, shoots: Shoots, bodie
     turn = bodies.turn[rows, slot]
     along = (share * pieces - piece) * bodies.length[rows, slot]
     place = bodies.origin[rows, slot] + frames.rotate(turn, along[..., None] * [1.0, 0.0, 0.0])
+    grown = 1.0 if shoots.leaf_grown is None else shoots.leaf_grown
     nodes = LeafNodes(
         turn=turn,
         along=along,
@@ -277,7 +278,7 @@ def place_leaves(scene: Scene, parameters: VineParameters, shoots: Shoots, bodie
         share=share,
         up=shoots.up[:, None],
         hand=np.where((rank + shoots.lateral_at[:, None]) % 2, 1.0, -1.0)[..., None],
-        grown=np.where(main, 1.0, LATERAL_AREA) * _leaf_size(parameters, shoots.fruit["variety"][:, :1]),
+        grown=np.where(main, 1.0, LATERAL_AREA) * _leaf_size(parameters, shoots.fruit["variety"][:, :1]) * grown,
     )
     leaf = grow_leaves(scene, parameters.leaf, nodes, shoots.leaf_normal, shoots.leaf_uniform)
     present = (rank < many) & leaf["present"] & (main | shoots.has_lateral[:, None])

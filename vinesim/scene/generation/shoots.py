@@ -9,6 +9,7 @@ import numpy as np
 
 from vinesim.core import frames, portable_math
 from vinesim.scene import builder
+from vinesim.scene.generation.bearers import Bearer, grow_bearers
 from vinesim.scene.generation.close_bunches import Canes, hang_bunches
 from vinesim.scene.generation.fixed_structure import FixedStructure
 from vinesim.scene.generation.fruit import choose_bunches, sample_fruit
@@ -65,6 +66,12 @@ class Shoots:
     """[8, shoot, MAX_NODES + LATERAL_NODES] Standard normal random numbers from which the leaves are generated."""
     leaf_uniform: np.ndarray
     """[4, shoot, MAX_NODES + LATERAL_NODES] Uniform random numbers from which the leaves are generated."""
+    bearers: tuple[Bearer, ...] = ()
+    """Two-year wood on which the shoots stand, in a scene with a date."""
+    leaf_grown: np.ndarray | None = None
+    """[shoot, MAX_NODES + LATERAL_NODES] Area of each leaf as a share of that of a grown leaf; None: all are grown."""
+    woody: float = 1.0
+    """Share of the length that has turned woody, in units of that at harvest."""
 
 
 def sample_shoots(scene: Scene, parameters: VineParameters, structure: FixedStructure) -> Shoots:
@@ -87,7 +94,10 @@ def sample_shoots(scene: Scene, parameters: VineParameters, structure: FixedStru
     number = np.tile(np.arange(each), arm_count * vines)
     share = 0.17 + 0.81 * (number + 0.2 + 0.6 * uniform()) / each
     seat = None
-    if scene.clutter.old_wood > 0.0:
+    dated = None if scene.date is None else grow_bearers(scene, structure, each)
+    if dated is not None:
+        share = dated.share
+    elif scene.clutter.old_wood > 0.0:
         seat = seat_on_spurs(scene, structure, each)
         share = seat.share
     where = share * arm_segments
@@ -97,6 +107,8 @@ def sample_shoots(scene: Scene, parameters: VineParameters, structure: FixedStru
     start = arm[rows, piece] + (arm[rows, piece + 1] - arm[rows, piece]) * (where - piece)[:, None]
     if seat is not None:
         start = start + seat.offset
+    if dated is not None:
+        start = dated.start
     along = frames.normalize((arm[:, -1] - arm[:, 0]) * [1.0, 1.0, 0.0])
 
     length = cane.length.at(uniform())
@@ -110,6 +122,8 @@ def sample_shoots(scene: Scene, parameters: VineParameters, structure: FixedStru
         lean = normal(2) * [cane.lean_along.value, cane.lean_across.value]
         across = frames.cross(np.array([0.0, 0.0, 1.0]), along)
         heading = along * lean[:, :1] + across * lean[:, 1:] + [0.0, 0.0, 1.0]
+        if dated is not None:
+            heading = heading + dated.aside
         up = along
     owner = np.repeat(np.arange(vines), per_vine)
     noise = normal(AXIS_SEGMENTS, 3)
@@ -159,6 +173,7 @@ def sample_shoots(scene: Scene, parameters: VineParameters, structure: FixedStru
         nodes=nodes,
         leaf_normal=leaf_normal,
         leaf_uniform=leaf_uniform,
+        bearers=() if dated is None else dated.bearers,
     )
 
 

@@ -63,13 +63,13 @@ def find_ties(
         "slot": slot,
         "point": along[:, None] * [1.0, 0.0, 0.0],
         "anchor": anchor,
-        "wire": _nearest_wire(structure, anchor, 1 - which if tendone else 0 * which),
+        "wire": nearest_wire(structure, anchor, 1 - which if tendone else 0 * which),
         "stiffness": np.full(len(slot), stiffness),
         "damping": np.full(len(slot), trellis.tie_damping.value * stiffness),
     }
 
 
-def _nearest_wire(structure: FixedStructure, points: np.ndarray, axis: np.ndarray) -> np.ndarray:
+def nearest_wire(structure: FixedStructure, points: np.ndarray, axis: np.ndarray) -> np.ndarray:
     """Returns the index [k] of the piece of wire that is nearest to each of ``points`` [k, 3] m, among the wires along
     x (``axis`` [k] is 0) or y (1)."""
     fixed = structure.fixed

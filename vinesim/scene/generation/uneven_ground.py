@@ -178,6 +178,7 @@ def raise_shoots(shoots: Shoots, rise: TrellisRise) -> Shoots:
         points=rise.raised(shoots.points),
         lateral_points=rise.raised(shoots.lateral_points),
         peduncle=_lifted(shoots.peduncle, start[..., None]),
+        bearers=tuple(dataclasses.replace(one, points=rise.raised(one.points)) for one in shoots.bearers),
     )
 
 

@@ -7,6 +7,7 @@ random number generator, seeded by (seed, row, place), so its numbers do not dep
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import pathlib
 
@@ -15,11 +16,14 @@ import numpy as np
 
 from vinesim.core import array_fields, disk_cache, frames, portable_math
 from vinesim.scene import berries, builder, leaves, palette, plant_parameters
+from vinesim.scene.generation.bearers import with_bearers
+from vinesim.scene.generation.dormant import Vines, build_dormant, ripe_canes
 from vinesim.scene.generation.fixed_structure import FixedStructure, build_fixed_structure
 from vinesim.scene.generation.old_wood import with_old_wood
 from vinesim.scene.generation.plant_bodies import Bodies, build_bodies, place_leaves
 from vinesim.scene.generation.shoot_slots import CORE_SLOTS, MAX_BUNCHES, cluster_slots, peduncle_slots
 from vinesim.scene.generation.shoots import Shoots, sample_shoots
+from vinesim.scene.generation.shoots_by_date import grow_to_date
 from vinesim.scene.generation.ties import find_ties
 from vinesim.scene.generation.uneven_ground import (
     TrellisRise,
@@ -31,12 +35,14 @@ from vinesim.scene.generation.uneven_ground import (
 from vinesim.scene.ids import Organ
 from vinesim.scene.look import Look
 from vinesim.scene.model import Model
+from vinesim.scene.nodes import DormantCanes, Nodes
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.plant_import.imported_plant import load_imported_plant
 from vinesim.scene.plant_import.ties import tie_to_wires
 from vinesim.scene.plant_import.wood import build_model, join_models
 from vinesim.scene.plant_parameters import VineParameters
-from vinesim.scene.spec import Clutter, Datum, Scene, Sun, Wind
+from vinesim.scene.season import SeasonState, load_season
+from vinesim.scene.spec import Clutter, Datum, Scene, Sun, Wind, on_its_date, season_of
 from vinesim.scene.terrain import Terrain, ground_height
 
 
@@ -50,9 +56,14 @@ def generate(scene: Scene) -> Model:
     parameters = plant_parameters.load_plant(scene.plants)
     terrain = build_terrain(scene)
 
+    scene = on_its_date(scene)
+
     def make() -> disk_cache.Arrays:
         model = _generate(scene, parameters, terrain)
-        return {name: getattr(model, name) for name in Model.array_fields()}
+        arrays = {name: getattr(model, name) for name in Model.array_fields()}
+        for part, kind in _DORMANT_TABLES.items():
+            arrays |= {f"{part}.{name}": getattr(getattr(model, part), name) for name in kind.array_fields()}
+        return arrays
 
     # settings that no plant depends on must not change the digest
     plants = msgspec.structs.replace(
@@ -75,14 +86,24 @@ def generate(scene: Scene) -> Model:
         None if terrain is None else (repr(terrain.origin), terrain.cell, terrain.slope, terrain.residual.tobytes())
     )
     imported = [(load_imported_plant(one.file), msgspec.structs.replace(one, file="")) for one in scene.imported]
-    digest = disk_cache.source_digest(_code_digest(), msgspec.json.encode((plants, parameters, imported, ground)))
+    curves = None if scene.date is None else load_season()
+    inputs = (plants, parameters, imported, ground, curves)
+    digest = disk_cache.source_digest(_code_digest(), msgspec.json.encode(inputs))
     arrays = disk_cache.load_or_make("vineyard", digest, make)
-    return Model(terrain=terrain, look=Look.of(scene), **arrays).check()
+    model = Model(terrain=terrain, look=Look.of(scene), **{name: arrays[name] for name in Model.array_fields()}).check()
+    for part, kind in _DORMANT_TABLES.items():
+        table = kind(**{name: arrays[f"{part}.{name}"] for name in kind.array_fields()})
+        setattr(model, part, table.check())
+    return model
 
 
 def generate_uncached(scene: Scene) -> Model:
     """Returns the same model as :func:`generate` without using the cache. For scenes that are needed only once."""
-    return _generate(scene, plant_parameters.load_plant(scene.plants), build_terrain(scene))
+    return _generate(on_its_date(scene), plant_parameters.load_plant(scene.plants), build_terrain(scene))
+
+
+_DORMANT_TABLES: dict[str, type[Nodes] | type[DormantCanes]] = {"nodes": Nodes, "canes": DormantCanes}
+"""Tables of a model besides its arrays, by the name of the model's field."""
 
 
 @functools.cache
@@ -96,18 +117,15 @@ def _code_digest() -> str:
 def _generate(scene: Scene, parameters: VineParameters, terrain: Terrain | None) -> Model:
     structure = build_fixed_structure(scene, parameters)
     shoots = sample_shoots(scene, parameters, structure)
-    bodies = build_bodies(parameters, shoots)
-    ties = find_ties(scene, parameters, structure, shoots, bodies)
-    if terrain is not None:
-        rise = TrellisRise(terrain, scene.layout)
-        structure = raise_structure(structure, terrain, rise)
-        shoots = raise_shoots(shoots, rise)
-        level = bodies
-        bodies = build_bodies(parameters, shoots)
-        ties = raise_ties(ties, shoots, level, bodies)
-    structure = with_old_wood(scene, structure, shoots.points[:, 0])
-    leaf = place_leaves(scene, parameters, shoots, bodies)
-    model = _assemble_model(scene, parameters, structure, shoots, bodies, leaf, ties)
+    state = season_of(scene)
+    if state is None:
+        model = _build_leafy(scene, parameters, terrain, structure, shoots)
+    elif state.has_shoots:
+        structure = with_bearers(structure, shoots.bearers, scene.pruning)
+        shoots = grow_to_date(scene, shoots, state)
+        model = _build_leafy(scene, parameters, terrain, structure, shoots)
+    else:
+        model = _build_bare(scene, parameters, terrain, Vines(structure, ripe_canes(shoots)), state)
     if terrain is not None:
         model.terrain = terrain
         for i, box in enumerate(scene.boxes):
@@ -131,6 +149,48 @@ def _generate(scene: Scene, parameters: VineParameters, terrain: Terrain | None)
         )
         model = join_models(model, tie_to_wires(plant, model, one.tie_gap, parameters.trellis))
     return model
+
+
+def _build_leafy(
+    scene: Scene,
+    parameters: VineParameters,
+    terrain: Terrain | None,
+    structure: FixedStructure,
+    shoots: Shoots,
+) -> Model:
+    """Returns the model of vines with green shoots, not yet in equilibrium."""
+    bodies = build_bodies(parameters, shoots)
+    ties = find_ties(scene, parameters, structure, shoots, bodies)
+    if terrain is not None:
+        rise = TrellisRise(terrain, scene.layout)
+        structure = raise_structure(structure, terrain, rise)
+        shoots = raise_shoots(shoots, rise)
+        level = bodies
+        bodies = build_bodies(parameters, shoots)
+        ties = raise_ties(ties, shoots, level, bodies)
+    structure = _with_old_wood(scene, structure, shoots)
+    leaf = place_leaves(scene, parameters, shoots, bodies)
+    return _assemble_model(scene, parameters, structure, shoots, bodies, leaf, ties)
+
+
+def _build_bare(
+    scene: Scene, parameters: VineParameters, terrain: Terrain | None, level: Vines, state: SeasonState
+) -> Model:
+    """Returns the model of dormant vines, not yet in equilibrium. ``level``: the vines on level ground."""
+    vines = level
+    if terrain is not None:
+        rise = TrellisRise(terrain, scene.layout)
+        vines = Vines(raise_structure(level.structure, terrain, rise), raise_shoots(level.shoots, rise))
+    vines = dataclasses.replace(vines, structure=_with_old_wood(scene, vines.structure, vines.shoots))
+    return build_dormant(scene, parameters, level, vines, state)
+
+
+def _with_old_wood(scene: Scene, structure: FixedStructure, shoots: Shoots) -> FixedStructure:
+    """Returns the structure with old wood: spur heads stand below shoots, or below two-year spurs."""
+    start = shoots.points[:, 0].copy()
+    for bearer in shoots.bearers:
+        start[list(bearer.shoots)] = bearer.points[0]
+    return with_old_wood(scene, structure, start, has_cordons=scene.pruning == "spur")
 
 
 def _assemble_model(

@@ -97,7 +97,7 @@ def join_models(first: Model, second: Model) -> Model:
                 here = first.fixed_organ == organ
                 b[second.fixed_organ == organ] += 1 + int(a[here].max(initial=-1))
         joined[name] = np.concatenate([a, b])
-    return Model(terrain=first.terrain, look=first.look, **joined).check()
+    return Model(terrain=first.terrain, look=first.look, nodes=first.nodes, canes=first.canes, **joined).check()
 
 
 def _on(old: np.ndarray, parent: np.ndarray) -> np.ndarray:

@@ -58,6 +58,9 @@ SEMANTIC_CLASSES = (
     "person",
     "robot",
     "box",
+    "spur",
+    "node",
+    "bud",
 )
 """Names of the classes in semantic images, by value of the pixel. ``bunch`` is the part of a bunch that is no berry."""
 _CLASS_OF_ORGAN = {

@@ -33,6 +33,7 @@ from vinesim.sensors import ground_truth
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export import annotations as formats
 from vinesim.sensors.export import images as picture
+from vinesim.sensors.export.dormant_views import node_records, view_of_node
 from vinesim.sensors.export.files import remove_partial_files, write_files
 from vinesim.sensors.export.mix import LoadedMix, draw_entry, draw_number, draw_sun
 from vinesim.sensors.export.views import Drive, ViewFinder
@@ -215,7 +216,9 @@ class VineyardRenderer:
         self.scene, self.drawn = plan.mix.vineyard(np.random.default_rng([plan.seed, 1, number]))
         self.bearing = draw_number(np.random.default_rng([plan.seed, 8, number]), plan.mix.table.sun.bearing)
         self.model = generate_uncached(self.scene)
-        if not len(self.model.bunch_body):
+        self.is_dormant = len(self.model.nodes.body) > 0
+        self._source = None if self.is_dormant else plan.snapshot_source  # actors stand at bunches
+        if not (len(self.model.bunch_body) or self.is_dormant):
             raise DatasetError(f"scene {self.scene.name!r} bears no bunch to look at; raise fruit.bunches")
         self.rest: Snapshot = rest_snapshot(self.model)
         self.ripeness = Ripeness.for_pictures(self.model, self.scene.seed)
@@ -261,9 +264,9 @@ class VineyardRenderer:
         rng = np.random.default_rng([plan.seed, 2, self.number])
         drive = Drive.random(rng, plan.mix.table.sequence, plan.sequence, self.scene.physics.dt)
         states: Iterator[Scenery] = itertools.repeat((self.rest, None, {}))
-        if plan.snapshot_source is not None:
+        if self._source is not None:
             life = np.random.default_rng([plan.seed, 5, self.number])
-            states = plan.snapshot_source.frames(self.model, life, self.scene.physics, drive.period)
+            states = self._source.frames(self.model, life, self.scene.physics, drive.period)
         shot: _Shot | None = None
         start = np.zeros(7)
         for frame in range(plan.sequence):
@@ -285,7 +288,7 @@ class VineyardRenderer:
         rng = np.random.default_rng([self.plan.seed, 2, image])
         all_trees = np.arange(len(self.model.tree_first))
         self.primitives.update(self.rest, all_trees)
-        source = self.plan.snapshot_source
+        source = self._source
         scenery: Scenery = (self.rest, None, {})
         if source is not None:
             life = np.random.default_rng([self.plan.seed, 5, image])
@@ -315,7 +318,9 @@ class VineyardRenderer:
         info = dataclasses.replace(info, fx=info.fx * zoom, fy=info.fy * zoom)
         view = draw_entry(rng, table.views)
         finder = ViewFinder(self.scene.name, self.primitives, snapshot, near, drive)
-        if is_negative:
+        if self.is_dormant:
+            seen, values = view_of_node(finder, rng, view, info)
+        elif is_negative:
             seen, values = finder.without_bunches(rng, view, info)
         else:
             places = [(one["x"], one["y"]) for one in activity.get("actors", [])]
@@ -371,6 +376,8 @@ class VineyardRenderer:
             "ids": formats.encode_labels(frame.labels),
             "berries": formats.encode_berry_numbers(seen),
         }
+        if self.is_dormant:
+            record["nodes"] = node_records(self.model, shot.snapshot, seen)
         if self.plan.semantic:
             pixels["semantic"] = formats.encode_classes(seen)
         setting = SensorSetting(sun, self.plan.seed, image, self.plan.device, threads=1)

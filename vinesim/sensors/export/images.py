@@ -57,6 +57,9 @@ _ORGAN_COLOUR = {
     Organ.BOX: (40, 90, 230),
     Organ.ROBOT: (235, 235, 235),
     Organ.HUMAN: (250, 120, 40),
+    Organ.SPUR: (120, 100, 90),
+    Organ.NODE: (70, 200, 220),
+    Organ.BUD: (255, 60, 60),
 }
 
 

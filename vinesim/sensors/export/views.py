@@ -207,6 +207,20 @@ class ViewFinder:
         turned[:3] -= frames.rotate(turned[3:], ray * depth)
         return turned, depth, depth * float(np.linalg.norm(ray))
 
+    def pose_at(self, point: np.ndarray, side: float, values: dict[str, float], info: CameraInfo) -> np.ndarray:
+        """Returns the pose [7] of the optical frame from which ``point`` [3] m is where ``values`` want it in the
+        picture; ``side``: side of the row on which the camera stands, 1 or -1."""
+        return self._place(point, -1, side, values, info)[0]
+
+    def is_free(self, pose: np.ndarray, entry: ViewEntry, distance: float) -> bool:
+        """Returns whether the camera may stand at ``pose`` [7], ``distance`` [m] from what it looks at."""
+        return self._is_free(pose, entry, distance)
+
+    @staticmethod
+    def is_obstructed(seen: PixelBuffers) -> bool:
+        """Returns whether something is too near to the camera."""
+        return _is_obstructed(seen.depth)
+
     def _outline(self, bunch: int, depth: float, info: CameraInfo) -> float:
         """Returns the area [px] of a bunch at ``depth`` [m], seen from the side, as an ellipse."""
         model = self.primitives.model
@@ -280,7 +294,8 @@ class _Wanted:
             return False
         if (pixels >= formats.MIN_ANNOTATED_PIXELS).sum() < self.bunches:
             return False
-        return not self.with_actors or bool((labels >= label(Organ.BOX, 0)).mean() >= MIN_ACTOR_SHARE)
+        actors = np.isin(labels // LABEL_STRIDE, (Organ.BOX, Organ.ROBOT, Organ.HUMAN))
+        return not self.with_actors or bool(actors.mean() >= MIN_ACTOR_SHARE)
 
 
 def _is_obstructed(depth: np.ndarray) -> bool:

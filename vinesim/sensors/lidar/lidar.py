@@ -23,7 +23,7 @@ import warp as wp
 from vinesim.core import frames
 from vinesim.core.thread_pool import MAX_THREADS, ThreadPool, usable_cores
 from vinesim.kernels.lidar import lidar_echoes, lidar_raster
-from vinesim.scene.ids import Organ, label
+from vinesim.scene.ids import PARTS_OF_CANE, Organ, label
 from vinesim.scene.plant_parameters import Number
 from vinesim.scene.values import CameraOutput, LevelLaser, LidarMount, LidarScan, Snapshot
 from vinesim.sensors import spec_file
@@ -97,13 +97,14 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     flicker: Annotated[Number, "1", (0.0, 2.0)]
     """Standard deviation of the logarithm of the signal, from shot to shot."""
     reflectance: dict[str, Annotated[Number, "1"]]
-    """Diffuse reflectance of each class of object: by name of an :class:`~vinesim.scene.ids.Organ` in lower case."""
+    """Diffuse reflectance of each class of object: by name of an :class:`~vinesim.scene.ids.Organ` in lower case.
+    Spurs, nodes and buds reflect as canes."""
 
     @classmethod
     def load(cls, name: str) -> LidarSpec:
         """Read a lidar's data sheet: ``name`` is the path of a file, or the name of a file in ``data/lidars``."""
         spec = spec_file.load("lidars", name, cls)
-        organs = {o.name.lower() for o in Organ if o != Organ.NOTHING}
+        organs = {o.name.lower() for o in Organ if o != Organ.NOTHING and o not in PARTS_OF_CANE}
         if set(spec.reflectance) != organs:
             wrong = sorted(set(spec.reflectance) ^ organs)[0]
             raise spec_file.SensorError(
@@ -288,6 +289,7 @@ class Lidar:
         reflectance = np.zeros(len(Organ), np.float32)
         for organ, number in spec.reflectance.items():
             reflectance[Organ[organ.upper()]] = number.value
+        reflectance[list(PARTS_OF_CANE)] = reflectance[Organ.CANE]
         receiver.reflectance = wp.array(reflectance, dtype=float, device=self.device)
         receiver.rays = round(self.spec.rays.value)
         receiver.used = round(spec.rays.value)

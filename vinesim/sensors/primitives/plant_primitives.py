@@ -13,6 +13,7 @@ from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.palette import DEFAULT, LeafColours
 from vinesim.sensors.primitives import textures
+from vinesim.sensors.primitives.dormant_primitives import wood_classes, wood_looks
 from vinesim.sensors.primitives.primitive_batches import Batch, make_batch, stack_columns
 from vinesim.sensors.raster.primitive_arrays import CONE, LEAF
 
@@ -41,12 +42,14 @@ def cane_batch(model: Model) -> Batch:
     index = tree.copy()
     bunch_of = model.bunch_of_body()[bodies]
     index = np.where(bunch_of >= 0, bunch_of, index)
+    organ, index = wood_classes(model, bodies, organ, index)
     # shoots become brown from the base: they are green towards the tip, brown where the wood is thick
     green = np.clip(1.6 - model.body_radius[bodies].mean(1) / 0.0022, 0.0, 1.0) * (seed[tree] < 0.6)
     green = np.where(organ == int(Organ.PEDUNCLE), 1.0, green)[:, None]
     wood = model.look.palette.wood
     tint = (1.0 - green) * np.array(wood.cane) * (0.7 + 0.6 * seed[tree, None]) + green * np.array(wood.stem)
     material = np.where(green[:, 0] > 0.5, int(materials.STEM), int(materials.CANE))
+    material, tint = wood_looks(model, bodies, material, tint)
     length = model.body_length[bodies]
     zero = np.zeros(len(bodies))
     return make_batch(

@@ -27,6 +27,7 @@ from vinesim.sensors.primitives import textures
 from vinesim.sensors.primitives.bunch_primitives import Ripeness, bunch_batches, bunch_bodies
 from vinesim.sensors.primitives.clutter import clutter_batches
 from vinesim.sensors.primitives.distant_rows import distant_batches, shaded_extent
+from vinesim.sensors.primitives.dormant_primitives import dormant_batches
 from vinesim.sensors.primitives.leaf_area_density import LeafDensity
 from vinesim.sensors.primitives.palette_colours import colour_struct
 from vinesim.sensors.primitives.plant_primitives import cane_batch, leaf_batches
@@ -231,7 +232,7 @@ class Primitives:
         corners ``low`` and ``high`` [2] m."""
         model = self.model
         static = self._static_carrier
-        batches = [cane_batch(model), *leaf_batches(model)]
+        batches = [cane_batch(model), *leaf_batches(model), *dormant_batches(model)]
         every = np.arange(len(model.bunch_body))
         pieces = [bunch_bodies(model, int(bunch)) for bunch in every]
         batches += bunch_batches(model, every, None, pieces, model.body_tree[model.bunch_body], self._ripeness)
