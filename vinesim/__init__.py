@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from vinesim.scene.physics_parameters import PhysicsParameters as PhysicsParameters
     from vinesim.scene.plant_import.imported_plant import ImportedPlant as ImportedPlant
     from vinesim.scene.plant_import.imported_plant import import_plant as import_plant
+    from vinesim.scene.spare_bodies import with_spares as with_spares
     from vinesim.scene.spec import Scene as Scene
     from vinesim.scene.spec import load_scene as load_scene
     from vinesim.scene.state import State as State
@@ -101,6 +102,7 @@ _MODULES = {
     "look_at": "api.sensors",
     "reachable_grasps": "api.picking",
     "sweep": "api.sweep",
+    "with_spares": "scene.spare_bodies",
 }
 """Module of each public name, relative to the package ``vinesim``."""
 
@@ -147,6 +149,7 @@ __all__ = [
     "look_at",
     "reachable_grasps",
     "sweep",
+    "with_spares",
 ]
 
 

@@ -138,7 +138,7 @@ class Physics:
     @property
     def faults(self) -> dict[str, int]:
         """Number of faults so far, by kind: trees and robots stopped, trees slowed, contacts dropped, geoms skipped,
-        grasps refused."""
+        grasps refused, cuts moved to a joint."""
         return {
             "trees_stopped": int(self.fault_guard.count.sum()),
             "trees_slowed": self.fault_guard.slowed,
@@ -146,6 +146,7 @@ class Physics:
             "contacts_dropped": self.contact_solver.dropped_contacts,
             "geoms_skipped": self.contact_solver.skipped_geoms,
             "grasps_refused": self.grasp_manager.refused_grasps,
+            "cuts_moved": self.plants.stumps.missing,
         }
 
     # ------------------------------------------------------------------ stages that pass values between parts
@@ -255,6 +256,7 @@ class Physics:
             moved_trees=np.union1d(self.plants.awake, self.remotely_posed),
             wind=self.wind_on_plants.state,
             wires=self.wire_shapes.poses(),
+            stumps=self.plants.stumps.table,
         )
 
     def visuals(self) -> tuple[RigidVisual, ...]:
@@ -319,8 +321,8 @@ class Physics:
         self._body_q = None
 
     def cut(self, body: int, at: float | None = None) -> None:
-        """Cut a piece of wood off its vine, between steps; see :meth:`DetachmentMonitor.cut`. ``at``: place [m] of the
-        cut along a segment of a peduncle."""
+        """Cut a piece of wood off its vine, between steps; see :meth:`DetachmentMonitor.cut`. ``at``: place of the cut
+        [m] from the body's origin."""
         self.detachment_monitor.cut(body, at=at)
         self._body_q = None
 
@@ -344,6 +346,11 @@ class Physics:
     def apply_remote_cut(self, body: int) -> None:
         """Cut off a piece of wood that another client has cut off; see :meth:`DetachmentMonitor.apply_remote_cut`."""
         self.detachment_monitor.apply_remote_cut(body)
+        self._body_q = None
+
+    def apply_remote_stump(self, stump: int, segment: int, at: float, *, floats: bool) -> None:
+        """Leave the stump of a cut that another client has made; see :meth:`DetachmentMonitor.apply_remote_stump`."""
+        self.detachment_monitor.apply_remote_stump(stump, segment, at, floats=floats)
         self._body_q = None
 
     def apply_remote_rest(self, trees: list[int], joint_q: list[np.ndarray]) -> None:

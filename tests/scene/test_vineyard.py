@@ -106,7 +106,9 @@ def test_bodies_of_a_tree_are_contiguous_parents_first(vineyard):
         bodies = np.arange(len(model.body_mass))[model.bodies_of(tree)]
         parents = model.body_parent[bodies]
         assert parents[0] == -1
-        assert ((parents[1:] >= bodies[0]) & (parents[1:] < bodies[1:])).all()
+        grown = ~model.is_spare()[bodies]
+        assert ((parents[1:] >= bodies[0]) & (parents[1:] < bodies[1:]))[grown[1:]].all()
+        assert (parents[~grown] == -1).all()
         assert (model.body_tree[bodies] == tree).all()
     assert model.tree_size.sum() == len(model.body_mass)
     assert 12 <= model.tree_core.min() <= model.tree_core.max() <= 26
@@ -322,7 +324,8 @@ def skew(v):
 
 def modes(model, tree):
     """Squared angular frequencies, shapes and mass matrix of small motions of one coarse tree about its equilibrium."""
-    bodies = slice(int(model.tree_first[tree]), int(model.tree_first[tree] + model.tree_core[tree]))
+    last = model.tree_first[tree] + model.tree_core[tree] - model.tree_spares[tree]
+    bodies = slice(int(model.tree_first[tree]), int(last))
     first = bodies.start
     n = bodies.stop - bodies.start
     parent = model.body_parent[bodies] - first

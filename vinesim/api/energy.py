@@ -54,12 +54,13 @@ def energy(plants: ArticulationSolver, gravity: float, trees: np.ndarray | None 
     kinetic = 0.5 * float(mass @ (velocity**2).sum(1) + np.einsum("bi,bij,bj->", omega, inertia, omega))
     turned = frames.log(state.joint_q[bodies].astype(float))
     elastic = 0.5 * float((plants.joint_stiffness[bodies] * turned**2).sum())
-    roots = model.body_parent[bodies] < 0
-    since = turned[roots] - frames.log(model.joint_settled[bodies[roots]].astype(float))
+    roots = plants.body_parent[bodies] < 0
+    since = turned[roots] - frames.log(plants.joint_settled[bodies[roots]].astype(float))
     arm_turn = plants.root_rests.turn[model.body_tree[bodies[roots]]]
     elastic -= 0.5 * float((plants.joint_stiffness[bodies[roots]] * arm_turn * since).sum())
-    ties = np.flatnonzero(np.isin(model.tie_body, bodies))
-    pose = state.body_q[model.tie_body[ties]].astype(float)
+    held = plants.ties.tie_body
+    ties = np.flatnonzero(np.isin(held, bodies))
+    pose = state.body_q[held[ties]].astype(float)
     point = pose[:, :3] + frames.rotate(pose[:, 3:], model.tie_point[ties].astype(float))
     away = point - plants.tie_anchor[ties]
     whole = point - model.tie_anchor[ties]
@@ -81,9 +82,8 @@ def _moving_bodies(plants: ArticulationSolver, trees: np.ndarray | None) -> np.n
     """Returns the indices [k] of the simulated bodies of ``trees``. Berry clusters that are locked to their bunch are
     not bodies of their own."""
     model = plants.model
-    size = np.where(plants.state.tree_fine, model.tree_size, model.tree_core)
     number = np.arange(len(model.body_mass)) - model.tree_first[model.body_tree]
-    moving = number < size[model.body_tree]
+    moving = number < plants.tree_moving[model.body_tree]
     if trees is not None:
         moving &= np.isin(model.body_tree, trees)
     return np.flatnonzero(moving)

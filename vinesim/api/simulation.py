@@ -316,19 +316,24 @@ class Simulation:
         self._pushed.add((robot, link))
 
     def cut(self, body: int, at: float | None = None) -> None:
-        """Cut a cane or a peduncle. What is beyond the cut falls.
+        """Cut a cane or a peduncle. What is beyond the cut falls, and the stump stays.
 
-        A peduncle is cut ``at`` [m] from the origin of its segment ``body`` (None: in the middle), and the bunch keeps
-        the stalk beyond the cut. A cane parts at the joint between ``body`` and its parent. ``body``: index in the
-        model. Raises :class:`UsageError` if a place is given for a cane, or a place that is not on the segment.
+        Args:
+            body: index in the model of the segment, or of a stump that a cut has left.
+            at: place of the cut [m] from the body's origin. None: in the middle of a peduncle, of which the bunch keeps
+                the stalk beyond the cut, and at the joint between a segment of a cane and its parent. A tree leaves as
+                many stumps as it has spare bodies: two in scenes, none in a model that was built without
+                :func:`vinesim.with_spares`. Further cuts are made at the joint (``cuts_moved`` in :attr:`faults`).
+
+        Raises :class:`UsageError` if the place is not on the segment.
         """
         body = self._body(body)
         if at is not None:
-            length = float(self.model.body_length[body])
-            if self.model.body_organ[body] != int(Organ.PEDUNCLE):
-                raise UsageError(f"at {at!r}: body {body} is no peduncle, and parts at its joint; leave out at")
-            if not (is_number(at) and 0.0 <= at <= length):
-                raise UsageError(f"at {at!r}: body {body} is {length:.4g} m long; give 0 to {length:.4g}")
+            start, end = (float(ends[body]) for ends in (self.physics.plants.body_start, self.physics.plants.body_end))
+            if self.model.body_organ[body] not in (int(Organ.CANE), int(Organ.PEDUNCLE)) or end <= start:
+                raise UsageError(f"at {at!r}: body {body} has no wood; leave out at")
+            if not (is_number(at) and start <= at <= end):
+                raise UsageError(f"at {at!r}: body {body} has wood from {start:.4g} to {end:.4g} m; give a place in it")
         self.physics.cut(body, at)
 
     def pick(self, bunch: int) -> None:

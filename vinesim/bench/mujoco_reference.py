@@ -105,7 +105,7 @@ class MujocoScene:
             RobotBody(robot, code, mine.parameters).add_to(spec)
         made = _add_plants(spec, model, np.maximum(model.joint_damping - dt * model.joint_stiffness, 0.0)[:, 1])
         shapes = plant_capsules(model)
-        fine = np.flatnonzero(shapes.level != 1)
+        fine = np.flatnonzero(np.isin(shapes.level, (0, 2)))
         columns = shapes.body[fine], shapes.start[fine], shapes.end[fine], shapes.radius[fine]
         for body, start, end, radius in zip(*columns, strict=True):
             kind = mujoco.mjtGeom.mjGEOM_SPHERE

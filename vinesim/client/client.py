@@ -457,6 +457,7 @@ class Client:
                 messages={kind: exchange.say(name) for kind, exchange in self.exchanges.items()},
                 carried_on=carried_on,
                 stalk_of=objects.stalk_of,
+                stumps_of=objects.stumps_of,
             )
             for update in settled:
                 # All copies hold the quantised state of the last message, so this client takes it, too.

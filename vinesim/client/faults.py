@@ -22,6 +22,7 @@ DESCRIPTIONS = {
     "contacts_dropped": "contacts were left out, because there were more than the capacity",
     "geoms_skipped": "static geoms near a tree were left out, because there are more than max_static_geoms_per_tree",
     "grasps_refused": "hands could not grasp plants, because too many bodies of plants were held already",
+    "cuts_moved": "cuts of canes were made at the joint before them, because their trees had no spare body for a stump",
     "couplings_refused": "forces of other actors on plants were refused, because too many bodies were held already",
     "messages_refused": "messages of other actors were refused, because they were malformed or impossible",
     "messages_lost": "messages of other actors were lost on this client, because they were too many or too large",

@@ -64,7 +64,7 @@ class PlantArrays:
         )
         self.bodies = SharedArrays(
             structs.PlantBodies,
-            parent=model.body_parent,
+            parent=plants.body_parent,
             tree=model.body_tree,
             is_cut=state.body_cut,
             q=state.body_q,

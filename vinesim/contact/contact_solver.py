@@ -16,7 +16,7 @@ import numpy as np
 from vinesim.contact.collision_arrays import PlantArrays, RigidArrays, kernel_parameters
 from vinesim.contact.detection import ContactDetection
 from vinesim.contact.impulse_solver import ImpulseSolver
-from vinesim.contact.plant_capsules import nearest_body, plant_capsules
+from vinesim.contact.plant_capsules import HIDDEN, nearest_body, plant_capsules
 from vinesim.kernels.contact import structs
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.rigid.rigid_world import RigidWorld
@@ -274,6 +274,26 @@ class ContactSolver:
             shapes.bunch[shapes.body == body] = -1
             body = int(model.body_parent[body])
         self.detection.shorten(int(np.flatnonzero(shapes.body == segment)[0]), length)
+
+    def divide_wood(self, segment: int) -> None:
+        """Give each part of a segment that cuts have divided its own shape; see :class:`Stumps`."""
+        plants = self.plants
+        shapes = self.capsules
+        parts = plants.stumps.parts_of(segment)
+        first = np.searchsorted(shapes.body, [body for body, _, _ in parts]).tolist()
+        last = first[-1]
+        for (body, _, _), capsule in zip(parts[:-1], first[:-1], strict=True):
+            if shapes.level[capsule] == HIDDEN:
+                tied = bool(np.isin(body, plants.ties.tie_body))
+                self.detection.pass_ties(last, capsule, body, tied=tied)
+        self.detection.divide(
+            last, [(capsule, start, end) for capsule, (_, start, end) in zip(first, parts, strict=True)]
+        )
+
+    def hide_wood(self, spare: int) -> None:
+        """Remove the shape of a body that is no stump any more."""
+        self.capsules.level[self.capsules.body == spare] = HIDDEN
+        self.detection.forget_clearances()
 
     def ignore_overlaps(self, bunch: int, low: np.ndarray, high: np.ndarray) -> None:
         """Disable contacts of a picked bunch with the trees that it overlaps; see

@@ -186,6 +186,43 @@ class ContactDetection:
         shapes.extent[capsule] = length + shapes.radius[capsule]
         self.forget_clearances()
 
+    def divide(self, capsule: int, parts: list[tuple[int, float, float]]) -> None:
+        """Divide the capsule of a piece of wood: each of ``parts`` is a capsule, which may be hidden, and the distances
+        [m] of its ends from the origin of the body, on the axis of ``capsule``."""
+        shapes = self.arrays.capsules
+        axis = shapes.local_end[capsule] - shapes.local_start[capsule]
+        length = float(axis[0])
+        way = (shapes.rest_end[capsule] - shapes.rest_start[capsule]) / length
+        rest = shapes.rest_start[capsule] - way * float(shapes.local_start[capsule, 0])
+        for part, start, end in parts:
+            shapes.local_start[part] = (start / length) * axis
+            shapes.local_end[part] = (end / length) * axis
+            shapes.rest_start[part] = rest + start * way
+            shapes.rest_end[part] = rest + end * way
+            shapes.radius[part] = shapes.radius[capsule]
+            shapes.material[part] = shapes.material[capsule]
+            shapes.extent[part] = end + shapes.radius[part]
+            shapes.level[part] = shapes.level[capsule]
+        self.forget_clearances()
+
+    def pass_ties(self, capsule: int, stump: int, joint: int, *, tied: bool) -> None:
+        """Let a stump pass the wires that the piece of wood passed to which it belonged.
+
+        Args:
+            capsule: capsule of the piece.
+            stump: capsule of the stump.
+            joint: body of the stump, which has the piece's joint now.
+            tied: whether the piece's own ties hold the stump now.
+        """
+        shapes = self.arrays.capsules
+        geom, at = shapes.tied_geom, shapes.tied_joint
+        body = int(shapes.body[capsule])
+        own = at[capsule] < 0
+        above = at[capsule] == body
+        geom[stump] = np.where(above | (own & tied), geom[capsule], -1)
+        at[stump] = np.where(above, joint, -1)
+        geom[capsule, own & tied] = -1
+
     def ignore_overlaps(self, bunch: int, low: np.ndarray, high: np.ndarray) -> None:
         """Disable the contacts of a picked bunch with the trees that it overlaps, until it no longer overlaps them.
 

@@ -12,6 +12,8 @@ from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
 MAX_SPHERES_PER_BUNCH = 7
+HIDDEN = 3
+"""Level of detail of the capsule of a spare body, which does not exist until a cut makes the body a stump."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +33,7 @@ class PlantCapsules:
     """[capsule] Level of detail at which the capsule exists.
 
     0: always; 1: while the tree's berry clusters are locked to their bunches (coarse); 2: while the clusters move
-    (fine, see ``State.tree_fine``).
+    (fine, see ``State.tree_fine``); :data:`HIDDEN`: never.
     """
     start: np.ndarray
     """[capsule, 3] Start of the axis, m, in the body's frame. Equal to ``end`` for a sphere."""
@@ -58,6 +60,7 @@ def plant_capsules(model: Model) -> PlantCapsules:
         for k in range(count)
     }
     bunch_of = model.bunch_of_body().tolist()
+    is_spare = model.is_spare().tolist()
     lengths = model.body_length.tolist()
     radii = model.body_radius.mean(1).tolist()
     for b, (length, thick) in enumerate(zip(lengths, radii, strict=True)):
@@ -70,6 +73,8 @@ def plant_capsules(model: Model) -> PlantCapsules:
             half = 0.5 * length
             inset = min(thick, half)
             parts.append((b, of_cluster[b], 2, inset, length - inset, thick))
+        elif is_spare[b]:
+            parts.append((b, -1, HIDDEN, 0.0, 0.0, 0.0))
         else:
             parts.append((b, bunch_of[b], 0, 0.0, length, thick))
     body, bunch, level, start, end, radius = np.array(parts, float).reshape(-1, 6).T  # also correct without bodies

@@ -162,6 +162,7 @@ def describe(
         friction: friction coefficient of all contacts.
     """
     kept = np.arange(len(model.body_mass)) - model.tree_first[model.body_tree] < model.tree_core[model.body_tree]
+    kept &= ~model.is_spare()
     mass, com, inertia = _rigid_bunches(model)
     compliance = np.zeros((len(kept), 3, 3))
     roots, amount, _, axis = arm_compliance(model)

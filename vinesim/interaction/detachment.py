@@ -1,8 +1,9 @@
 """Detachment: bunches that are pulled or bent off their peduncles, and wood that is cut by a closing blade.
 
 A detached bunch becomes a free body of the rigid world in the same tick, with its pose, velocity and weight. Its
-peduncle and a stub of one gram stay on the tree, so the numbering of the tree's bodies never changes. A cane that is
-cut falls with everything that grows on it, including its bunches (:meth:`ArticulationSolver.cut`).
+peduncle and a stub of one gram stay on the tree, so the numbering of the tree's bodies never changes. A cane is cut
+where the blade is: what is beyond the cut falls with everything that grows on it, including its bunches, and the stump
+stays (:meth:`ArticulationSolver.cut`).
 """
 
 from __future__ import annotations
@@ -25,8 +26,11 @@ from vinesim.rigid.free_bunch import FreeBunch
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene.ids import Organ
 from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.scene.spare_bodies import PLACE_STEP
 from vinesim.scene.values import Contact, Detachment
 
+SAME_CUT = 2e-3
+"""Wood shorter than this before or beyond a cut [m] is not cut again: a blade that closes twice cuts once."""
 STUB_MASS = 1e-3
 """Mass of the stub that stays on the tree in place of a bunch [kg]."""
 
@@ -184,7 +188,9 @@ class DetachmentMonitor:
                         continue
                     bunch = int(self._bunch_of[body])
                     if bunch < 0:
-                        self.cut(body, "blade", blade.actor)
+                        place = self._place_on_cane(blade, body)
+                        if place is not None:
+                            self.cut(body, "blade", blade.actor, place)
                     elif self.plants.state.bunch_attached[bunch]:
                         self.pick(bunch, "blade", blade.actor, *self._cut_in_peduncle(blade, bunch))
                 blade.detachments = tuple(self._detachments[before:])
@@ -199,24 +205,46 @@ class DetachmentMonitor:
     def cutting_force(self, body: int) -> float:
         """Returns the force [N] that cuts a piece of wood: its cross-section at the root end times
         ``cutting_strength``."""
-        return self._cutting_strength * math.pi * float(self.plants.model.body_radius[body, 0]) ** 2
+        segment = self.plants.stumps.segment_of(body)
+        return self._cutting_strength * math.pi * float(self.plants.model.body_radius[segment, 0]) ** 2
 
     def _bodies_in_mouth(self, blade: Blade) -> np.ndarray:
-        """Returns the pieces of wood [k] whose axis passes through a blade's mouth; of each branch only the piece
-        nearest the root."""
-        model = self.plants.model
+        """Returns the pieces of wood [k] that a closing blade cuts: their axis passes through its mouth, and the axis
+        of a cane also through the plane in which the blades close. Of each branch only the piece nearest the root."""
         body_q = self.plants.state.body_q
         mouth = frames.compose(self.rigid.link_pose(blade.actor, blade.link), blade.pose)
         far = np.linalg.norm(blade.half)
         apart = body_q[:, :3] - mouth[:3].astype(np.float32)
-        reach = far + model.body_length
+        reach = far + self.plants.body_end
         near = np.flatnonzero(self._wood & ((apart * apart).sum(1) < reach * reach))
+        near = near[self.plants.body_end[near] > self.plants.body_start[near]]
         _, _, enter, leave = self._axes_in_mouth(blade, near)
         caught = near[enter <= leave]
-        caught = caught[~self.plants.state.body_cut[caught]]
+        canes = caught[self._bunch_of[caught] < 0].tolist()
+        missed = [body for body in canes if self._place_on_cane(blade, body) is None]
+        caught = caught[~np.isin(caught, missed)]
         inside = np.zeros(len(self._wood), bool)
         inside[caught] = True
         return caught[~self._has_marked_ancestor(caught, inside)]
+
+    def _place_on_cane(self, blade: Blade, body: int) -> float | None:
+        """Returns the place [m] along a piece of cane in a blade's mouth at which the blade cuts it: where its axis
+        crosses the plane in which the blades close. Wood that lies in this plane is cut at the point nearest to it.
+
+        None if the blades close beside it, or where it is cut already and no part can be split off.
+        """
+        plants = self.plants
+        bodies = np.array([body])
+        start, along, enter, leave = (values[0] for values in self._axes_in_mouth(blade, bodies))
+        share = float(np.clip(-start[2] / along[2], enter, leave))
+        segment = plants.stumps.segment_of(body)
+        radius = float(plants.model.body_radius[segment].mean())
+        if enter > leave or abs(start[2] + share * along[2]) > radius:
+            return None
+        first, end = float(plants.body_start[body]), float(plants.body_end[body])
+        at = first + share * (end - first)
+        is_fresh = (first > 0.0 or plants.state.body_cut[body]) and at - first < SAME_CUT
+        return None if is_fresh or (end < float(plants.model.body_length[segment]) and end - at < SAME_CUT) else at
 
     def _cut_in_peduncle(self, blade: Blade, bunch: int) -> tuple[int, float]:
         """Returns the segment of a bunch's peduncle in which a closing blade cuts it, and the place [m] along it: the
@@ -231,14 +259,16 @@ class DetachmentMonitor:
         return int(segments[best]), float(crossing[best] * model.body_length[segments[best]])
 
     def _axes_in_mouth(self, blade: Blade, bodies: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Returns the axes of ``bodies`` [k] in the frame of a blade's mouth: starts [k, 3] m and vectors to the tips
-        [k, 3] m, and the shares [k] of these vectors between which the axes are in the mouth; no share is in it if the
-        first is larger than the second."""
+        """Returns the axes of the wood of ``bodies`` [k] in the frame of a blade's mouth: starts [k, 3] m and vectors
+        to the ends [k, 3] m, and the shares [k] of these vectors between which the axes are in the mouth; no share is
+        in it if the first is larger than the second."""
         body_q = self.plants.state.body_q
         mouth = frames.compose(self.rigid.link_pose(blade.actor, blade.link), blade.pose)
         start = frames.rotate(frames.conjugate(mouth[3:]), body_q[bodies, :3] - mouth[:3])
         along = frames.rotate(frames.multiply(frames.conjugate(mouth[3:]), body_q[bodies, 3:]), np.array([1.0, 0, 0]))
-        along = along * self.plants.model.body_length[bodies, None]
+        first = self.plants.body_start[bodies, None]
+        start = start + first * along
+        along = along * (self.plants.body_end[bodies, None] - first)
         # slab test: the part of each axis inside the box
         along = np.where(np.abs(along) < 1e-12, 1e-12, along)
         one = (-blade.half - start) / along
@@ -250,7 +280,7 @@ class DetachmentMonitor:
     def _has_marked_ancestor(self, bodies: np.ndarray, marked: np.ndarray) -> np.ndarray:
         """Returns for each of the ``bodies`` [k] whether it descends from a body in ``marked`` [body] bool, without a
         cut in between."""
-        parent = self.plants.model.body_parent
+        parent = self.plants.body_parent
         cut = self.plants.state.body_cut
         below = np.zeros(len(bodies), bool)
         at = bodies.copy()
@@ -347,11 +377,12 @@ class DetachmentMonitor:
         return whole, velocity
 
     def cut(self, body: int, cause: str = "command", actor: str = "", at: float | None = None) -> None:
-        """Cut a piece of wood. What is beyond the cut falls. Call this between steps.
+        """Cut a piece of wood ``at`` [m] from the origin of its body. What is beyond the cut falls, the stump stays.
+        Call this between steps.
 
-        A peduncle is cut ``at`` [m] from the origin of the segment ``body``, by default in its middle, and its bunch
-        keeps the stalk beyond the cut. A cane parts at the joint between ``body`` and its parent, and ``at`` does not
-        count. Raises :class:`ValueError` if the piece cannot be cut.
+        A peduncle is cut in its middle unless ``at`` is given, and its bunch keeps the stalk beyond the cut. A cane
+        parts at the joint between ``body`` and its parent if ``at`` is None or 0, or where
+        :meth:`ArticulationSolver.cut` has to. Raises :class:`ValueError` if the piece cannot be cut there.
         """
         plants = self.plants
         body = checked_index("body", body, len(self._wood))
@@ -361,14 +392,18 @@ class DetachmentMonitor:
             at = 0.5 * float(plants.model.body_length[body]) if at is None else at
             self.pick(int(self._bunch_of[body]), cause, actor, body, at)
             return
-        if plants.state.body_cut[body]:
+        if plants.state.body_cut[body] and not at:
             raise ValueError(f"body {body} was cut already")
         carried = plants.joint_wrench(np.array([body]))[0]
         tree = int(plants.model.body_tree[body])
         plants.wake(tree)
         plants.forward_kinematics(np.array([tree]))
-        plants.cut(body)
-        self._record(body, -1, cause, actor, carried)
+        stump = plants.cut(body, 0.0 if at is None else at)
+        place = None
+        if stump >= 0:
+            self.contact_solver.divide_wood(plants.stumps.segment_of(body))
+            place = body, float(plants.state.stump_end[stump])
+        self._record(body, -1, cause, actor, carried, place)
 
     def apply_remote_pick(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
         """Detach a bunch that another client has detached, and set its ``pose`` [7] and ``velocity`` [6].
@@ -399,6 +434,29 @@ class DetachmentMonitor:
             tree = int(self.plants.model.body_tree[body])
             self.plants.wake(tree)
             self.plants.cut(body)
+
+    def apply_remote_stump(self, stump: int, segment: int, at: float, *, floats: bool) -> None:
+        """Make a spare body the stump of a cut that another client has made ``at`` [m] along a segment of a cane.
+        ``floats``: whether the stump has been cut off, too. The caller cuts off what is beyond.
+
+        If the spare is a stump already, the cut of the lower segment is valid, and the lower place: all clients agree
+        on this one. The other cut is then at the joint. Nothing happens if the wood cannot be split there.
+        """
+        plants = self.plants
+        before = int(plants.state.stump_of[stump])
+        if before >= 0 and (before, round(float(plants.state.stump_end[stump]) / PLACE_STEP)) <= (
+            segment,
+            round(at / PLACE_STEP),
+        ):
+            return
+        plants.wake(int(plants.model.body_tree[stump]))
+        if before >= 0:
+            plants.withdraw_stump(stump)
+            self.contact_solver.divide_wood(before)
+            self.contact_solver.hide_wood(stump)
+        if plants.stumps.can_leave(segment, at):
+            plants.leave_stump(stump, segment, at, floats=floats)
+            self.contact_solver.divide_wood(segment)
 
     def _record(
         self,

@@ -82,6 +82,23 @@ class GraspManager:
         if self._grasps:
             self.plants.wake(self.held_trees)
 
+    def _follow_cut(self, grasp: _PlantGrasp) -> _PlantGrasp:
+        """Returns a grasp of the wood at the grasped point, which belongs to another body after a cut."""
+        plants = self.plants
+        if plants.state.stump_of[grasp.body] < 0 and plants.body_start[grasp.body] == 0.0:
+            return grasp
+        parts = plants.stumps.parts_of(plants.stumps.segment_of(grasp.body))
+        body = next((body for body, _, end in parts if grasp.point[0] < end), parts[-1][0])
+        if body == grasp.body:
+            return grasp
+        anchor, stiffness, damping = (
+            values[grasp.tie].copy() for values in (plants.tie_anchor, plants.tie_stiffness, plants.tie_damping)
+        )
+        plants.remove_tie(grasp.body, grasp.tie)
+        tie = plants.add_tie(body, grasp.point, float(stiffness), float(damping))
+        plants.tie_anchor[tie] = anchor
+        return dataclasses.replace(grasp, body=body, tie=tie)
+
     def end_step(self, detachments: tuple[Detachment, ...]) -> None:
         """Place hands on the plants that they hold after a step, and weld detached bunches to the hands that hold
         them."""
@@ -101,6 +118,10 @@ class GraspManager:
             elif self._is_bunch_gone(grasp):
                 self.release(*key)
             else:
+                moved = self._follow_cut(grasp)
+                if moved is not grasp:
+                    grasp = self._grasps[key] = moved
+                    self.rigid.grasp_plant(*key, grasp.body)
                 contacts.append(self._place_on_plant(human, hand, grasp))
         self.contacts = tuple(contacts)
 

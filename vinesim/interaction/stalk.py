@@ -14,17 +14,15 @@ import numpy as np
 from vinesim.contact.contact_solver import ContactSolver
 from vinesim.core import frames
 from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.plants.segment_parts import SHORTEST
 from vinesim.rigid.free_bunch import FreeBunch
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
+from vinesim.scene.spare_bodies import PLACE_STEP
 from vinesim.scene.values import Stalk
 
-PLACE_STEP = 1e-4
-"""Unit in which the place of a cut along its segment is counted [m], so that all clients cut at the same place."""
 GHOST_SHARE = 1e-3
 """Share of its mass that a segment of stalk keeps on the tree after it has left with its bunch."""
-SHORTEST = 5e-4
-"""Shortest part that a cut leaves on either side [m]. A shorter part would be too light for its joint."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -6,8 +6,9 @@ contact. It passes these wrenches to ``integrate()``. Sleeping trees take no tim
 
 A tree with berry clusters is *coarse* or *fine*. In a coarse tree each bunch is one compound body, to which its
 clusters are locked. In a fine tree the clusters move. ``refine()`` makes a tree fine, ``coarsen()`` makes it coarse
-again. ``cut()`` detaches a body from its parent; the body becomes a floating root that carries its descendants. All
-three are called between steps, after ``integrate()`` and before the next ``predict()``.
+again. ``cut()`` detaches a body from its parent; the body becomes a floating root that carries its descendants. A cut
+within a segment leaves a stump, for which the tree has spare bodies. All three are called between steps, after
+``integrate()`` and before the next ``predict()``.
 
 The scheme (:mod:`vinesim.kernels.plants`) damps as if every joint's beta (damping / stiffness) were larger by
 ``(2 phi - 1) dt``, with phi the implicitness of the integrator (0.5 trapezoidal to 1 backward Euler). So the solver
@@ -17,6 +18,7 @@ subtracts that amount from the model's damping, down to zero. The total damping 
 from __future__ import annotations
 
 import dataclasses
+import logging
 import math
 import weakref
 from collections.abc import Callable, Sequence
@@ -51,8 +53,10 @@ from vinesim.kernels.plants.prediction import predict
 from vinesim.kernels.plants.tree_checks import find_fastest
 from vinesim.plants.contact_loads import ContactLoads
 from vinesim.plants.device_buffers import DeviceBuffers
+from vinesim.plants.segment_parts import Part, joint_compliance, part_of, place_between, relaxed_joint
 from vinesim.plants.ties import RootRests, TieTable, turning_damping
 from vinesim.plants.validation import checked_trees, validate
+from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
@@ -71,6 +75,7 @@ _COUNTS = 9
 """Length of the array of counts. The entry :data:`_NEXT_LEVEL` is the number of the next substep, the entry
 :data:`_LEVELS` the number of substeps of the step."""
 
+_log = logging.getLogger(__name__)
 _NO_TREES = np.zeros(0, np.int32)
 _NO_WRENCHES = np.zeros((0, 6), np.float32)
 
@@ -178,6 +183,8 @@ class ArticulationSolver:
             then=() if buffers.has_copies else (self.launches.wrenches,),
         )
         self._list_awake()
+        self.stumps = Stumps(self)
+        """The stumps that cuts have left, and the spare bodies for more."""
         self._detach_joints(self.bodies_of(np.unique(model.body_tree[state.body_cut])))
         self.berry_clusters = BerryClusters(self)
         """Locks and unlocks berry clusters. :class:`DetachmentMonitor` also uses it for bunches that it detaches."""
@@ -241,8 +248,20 @@ class ArticulationSolver:
         self.joint_damping = model.joint_damping.copy()
         """The model's damping, but zero where a body has been cut off. If ties hold the cut-off part, the entry is the
         damping with which the ties resist its rotation."""
-        self.tree_moving = np.where(state.tree_fine, model.tree_size, model.tree_core).astype(np.int32)
-        """[tree] Number of bodies of each tree that move: all bodies, or all except the berry clusters."""
+        self.core_moving = model.tree_core - model.tree_spares
+        """[tree] Number of bodies of each tree's core that move: all except the spare bodies that are not yet used."""
+        self.tree_moving = np.where(state.tree_fine, model.tree_size, self.core_moving).astype(np.int32)
+        """[tree] Number of bodies of each tree that move: all bodies, or those of the core that move."""
+        self.body_parent = model.body_parent.copy()
+        """[body] Parent of each body, also of stumps. A body that was cut off keeps its former parent here."""
+        self.body_start = np.zeros(bodies, np.float32)
+        self.body_end = np.where(model.is_spare(), 0.0, model.body_length).astype(np.float32)
+        """[body] m: distance from each body's origin to the end of its wood.
+
+        ``body_start`` [body] m: distance to the beginning of its wood, which is 0 unless a cut has left a stump.
+        """
+        self.joint_settled = model.joint_settled.copy()
+        """[body, 4] ``Model.joint_settled`` of each joint, also of stumps."""
         self.body_impulse = np.zeros((bodies, 6), np.float32)
         """[body, 6] N s, N m s: scratch for the impulses of a plastic impact."""
         self.joint_xd_free = np.zeros((bodies, 3), np.float32)
@@ -411,31 +430,70 @@ class ArticulationSolver:
         """
         self.berry_clusters.coarsen(trees)
 
-    def cut(self, body: int) -> None:
-        """Cut a body off its parent. The body and its descendants fall, with their present poses and velocities.
+    def cut(self, body: int, at: float = 0.0) -> int:
+        """Cut a body of wood. What is beyond the cut, with its descendants, falls with its present pose and velocity.
 
-        The tree wakes. Indices of bodies never change. Raises :class:`ValueError` if the body cannot be cut.
+        ``at``: place of the cut [m] from the body's origin; 0: at the joint between the body and its parent. The wood
+        before the cut becomes a stump, whose body is returned; -1 if there is none. If the tree has no spare body for a
+        stump, or the wood cannot be split, the cut is made at the joint, and the log says why. The tree wakes. Indices
+        of bodies never change. Raises :class:`ValueError` if the body cannot be cut there.
         """
         model = self.model
         state = self.state
         body = checked_index("body", body, len(model.body_mass))
         tree = int(model.body_tree[body])
-        if state.body_cut[body]:
-            raise ValueError(f"body {body} of tree {tree} has been cut off already")
         if body - model.tree_first[tree] >= model.tree_core[tree]:
             raise ValueError(f"body {body} of tree {tree} is a berry cluster; cut off its bunch")
+        if model.is_spare()[body] and state.stump_of[body] < 0:
+            raise ValueError(f"body {body} of tree {tree} is a spare without wood")
+        spare = -1
+        if at != 0.0:
+            at = place_between(float(self.body_start[body]), float(self.body_end[body]), at, body)
+            spare = self.stumps.spare_for(body, at)
+        if spare < 0 and state.body_cut[body]:
+            raise ValueError(f"body {body} of tree {tree} has been cut off already")
         self.forward_kinematics(tree)
-        state.joint_x[body] = state.body_q[body, :3]
-        state.joint_q[body] = state.body_q[body, 3:]
-        state.joint_xd[body] = state.body_qd[body, :3]
-        state.joint_qd[body] = state.body_qd[body, 3:]
-        state.body_cut[body] = True
+        if spare >= 0:
+            self.stumps.leave(spare, self.stumps.segment_of(body), at, floats=bool(state.body_cut[body]))
+        self._cut_off(body)
         self._detach_joints(self.bodies_of(np.array([tree])))
         self.wake(tree)
+        return spare
+
+    def leave_stump(self, spare: int, segment: int, at: float, *, floats: bool) -> None:
+        """Make a spare body the stump of a cut that another client has made ``at`` [m] along ``segment``, with the
+        present pose of that wood. The caller cuts off what is beyond.
+
+        ``floats``: whether the stump has no parent. Raises :class:`ValueError` if the wood cannot be split there.
+        """
+        tree = np.array([self.model.body_tree[spare]])
+        self.forward_kinematics(tree)
+        self.stumps.leave(spare, segment, at, floats=floats)
+        self._detach_joints(self.bodies_of(tree))
+
+    def withdraw_stump(self, spare: int) -> None:
+        """Make a stump a spare body again: another client has made another cut with it. The wood beyond, which stays
+        cut off, begins at the joint."""
+        tree = np.array([self.model.body_tree[spare]])
+        self.stumps.withdraw(spare)
+        self._detach_joints(self.bodies_of(tree))
+        self.forward_kinematics(tree)
+
+    def _cut_off(self, body: int) -> None:
+        """Make a body a floating root in its present pose."""
+        state = self.state
+        if not state.body_cut[body]:
+            state.joint_x[body] = state.body_q[body, :3]
+            state.joint_q[body] = state.body_q[body, 3:]
+            state.joint_xd[body] = state.body_qd[body, :3]
+            state.joint_qd[body] = state.body_qd[body, 3:]
+            state.body_cut[body] = True
 
     def _detach_joints(self, bodies: np.ndarray) -> None:
         """Read from the state which bodies are cut off. ``bodies``: all bodies of some trees."""
         cut = bodies[self.state.body_cut[bodies]]
+        held = bodies[~self.state.body_cut[bodies]]
+        self._parent[held] = self.body_parent[held]
         self._parent[cut] = -1
         self._offset[cut] = 0.0
         self._rest[cut] = frames.IDENTITY
@@ -762,7 +820,7 @@ class BerryClusters:
         riding = self.clusters_of(trees)
         impulse = self.lock(bunches)
         solver.state.tree_fine[trees] = False
-        solver.tree_moving[trees] = solver.model.tree_core[trees]
+        solver.tree_moving[trees] = solver.core_moving[trees]
         solver.state.joint_qd[riding] = 0.0
         solver.velocity_free[riding] = 0.0
         solver.acceleration[riding] = 0.0
@@ -918,6 +976,254 @@ class BerryClusters:
         return np.concatenate([linear.sum(1), angular.sum(1)], -1)
 
 
+# Stumps: the parts of segments of wood before a cut, for which each tree has a few spare bodies.
+
+
+class Stumps:
+    """Makes spare bodies stumps, in the trees of one solver; see :meth:`ArticulationSolver.cut`.
+
+    The cuts of a segment divide it into parts. The last part is the segment's own body, which carries what grows at its
+    tip; the other parts are stumps. All have the frame of the segment. Which part is where follows from
+    ``State.stump_of`` and ``State.stump_end`` alone.
+    """
+
+    def __init__(self, solver: ArticulationSolver) -> None:
+        self._solver: ArticulationSolver = weakref.proxy(solver)  # no cycle of references
+        self.missing = 0
+        """Number of cuts that were made at a joint because no spare body was left, or the wood could not be split."""
+        self.table = np.zeros((0, 3))
+        """[k, 3] Body of each stump, segment that was cut, and end of the stump [m]. A cut makes a new table."""
+        self._compliance = np.ones(len(solver.model.body_mass))
+        """[body] Compliance of each joint, relative to that of the model's joint."""
+        self._spares = np.flatnonzero(solver.model.is_spare())
+        used = self._spares[solver.state.stump_of[self._spares] >= 0]
+        for segment in np.unique(solver.state.stump_of[used]).tolist():
+            self._restore(segment)
+
+    def segment_of(self, body: int) -> int:
+        """Returns the segment of which a body is a part: the body itself, unless it is a stump."""
+        of = int(self._solver.state.stump_of[body])
+        return body if of < 0 else of
+
+    def parts_of(self, segment: int) -> list[tuple[int, float, float]]:
+        """Returns body, start [m] and end [m] of each part of a segment's wood, from its joint to its tip."""
+        state = self._solver.state
+        spares = self._spares_of(segment)
+        stumps = spares[state.stump_of[spares] == segment]
+        stumps = stumps[np.argsort(state.stump_end[stumps], kind="stable")]
+        bodies = [*stumps.tolist(), segment]
+        edges = [0.0, *state.stump_end[stumps].tolist(), float(self._solver.model.body_length[segment])]
+        return list(zip(bodies, edges[:-1], edges[1:], strict=True))
+
+    def _spares_of(self, body: int) -> np.ndarray:
+        """Returns the spare bodies of the tree of a body."""
+        model = self._solver.model
+        tree = model.body_tree[body]
+        end = int(model.tree_first[tree] + model.tree_core[tree])
+        return np.arange(end - int(model.tree_spares[tree]), end)
+
+    def spare_for(self, body: int, at: float) -> int:
+        """Returns the spare body that can become the stump of a cut ``at`` [m] along ``body``. Returns -1 and writes a
+        line to the log if there is none."""
+        solver = self._solver
+        model = solver.model
+        segment = self.segment_of(body)
+        spares = self._spares_of(body)
+        free = spares[solver.state.stump_of[spares] < 0]
+        if len(free) and not (why := self._obstacle(segment, body, at)):
+            return int(free[0])
+        why = why if len(free) else f"the {len(spares)} spare bodies of tree {model.body_tree[body]} are stumps already"
+        self.missing += 1
+        _log.warning("cut %.1f mm along body %d was made at its joint: %s", 1e3 * at, body, why)
+        return -1
+
+    def can_leave(self, segment: int, at: float) -> bool:
+        """Returns whether a stump can be left by a cut ``at`` [m] along a segment, if there is a spare body."""
+        body = next((body for body, start, end in self.parts_of(segment) if start < at < end), -1)
+        return body >= 0 and not self._obstacle(segment, body, at)
+
+    def _obstacle(self, segment: int, body: int, at: float) -> str:
+        """Returns why the part ``body`` of a segment cannot be split ``at`` [m] along it; empty if it can be."""
+        model = self._solver.model
+        grown = model.body_parent == segment
+        if model.body_organ[segment] != int(Organ.CANE):
+            return "it is no cane"
+        if (model.body_offset[grown, 0] < at).any():
+            return "something grows on it before the cut"
+        if not self._solver.ties.can_split(body, at):
+            return "its ties are not in order along it"
+        try:
+            part_of(model, segment, 0.0, at)
+        except ValueError as reason:
+            return str(reason)
+        return ""
+
+    def leave(self, spare: int, segment: int, at: float, *, floats: bool) -> None:
+        """Make ``spare`` the stump of a cut ``at`` [m] along ``segment``. Its body, and the part that was there, get
+        their shares. The caller cuts off that part, and calls ``_detach_joints``. ``floats``: the stump has no parent.
+
+        Raises :class:`ValueError` if the wood cannot be split there.
+        """
+        solver = self._solver
+        model = solver.model
+        state = solver.state
+        old, start, end = next(part for part in self.parts_of(segment) if part[1] < at < part[2])
+        before = part_of(model, segment, start, end)
+        parts = part_of(model, segment, start, at), part_of(model, segment, at, end)
+        share = float(solver.body_mass[old]) / before.mass  # not 1 after set_mass
+        share = 1.0 if abs(share - 1.0) < 1e-5 else share
+        state.stump_of[spare] = segment
+        state.stump_end[spare] = at
+        was_cut = bool(state.body_cut[old])
+        state.body_q[spare] = state.body_q[old]
+        state.body_qd[spare] = state.body_qd[old]
+        solver.body_load[spare] = 0.0
+        if floats:
+            solver._cut_off(spare)
+        elif was_cut:  # the piece left before its stump was known
+            self._take_joint(spare, segment)
+        else:
+            state.joint_q[spare] = state.joint_q[old]
+            state.joint_qd[spare] = state.joint_qd[old]
+            solver.joint_stiffness[spare] = solver.joint_stiffness[old]
+            solver.joint_damping[spare] = solver.joint_damping[old]
+            solver._rest[spare] = solver._rest[old]
+            self._compliance[spare] = self._compliance[old]
+        for body, part in zip((spare, old), parts, strict=True):
+            self._shape(body, part, share)
+        self._attach(spare, segment)
+        self._set_spans(segment)
+        solver.ties.split(old, spare, at)
+        for joint, of in [(spare, segment), *(self._joints_on(segment) if old == segment else [])]:
+            if not state.body_cut[joint]:
+                self._adjust_joint(joint, of, turns=not (joint == spare and was_cut))
+        if was_cut and not floats:
+            state.joint_q[spare] = solver.joint_settled[spare]
+            state.joint_qd[spare] = 0.0
+
+    def withdraw(self, spare: int) -> None:
+        """Make a stump a spare body again. Its wood returns to the part beyond it, which stays cut off. The caller
+        calls ``_detach_joints``."""
+        solver = self._solver
+        model = solver.model
+        state = solver.state
+        segment = self.segment_of(spare)
+        parts = self.parts_of(segment)
+        number = next(i for i, part in enumerate(parts) if part[0] == spare)
+        beyond, begin, end = parts[number + 1]
+        share = float(solver.body_mass[beyond]) / part_of(model, segment, begin, end).mass
+        self._shape(beyond, part_of(model, segment, parts[number][1], end), share)
+        state.stump_of[spare] = -1
+        state.stump_end[spare] = 0.0
+        state.body_cut[spare] = False
+        for row, rest in (
+            (state.joint_q, frames.IDENTITY),
+            (state.joint_qd, 0.0),
+            (state.joint_x, 0.0),
+            (state.joint_xd, 0.0),
+            (solver._offset, 0.0),
+            (solver._rest, frames.IDENTITY),
+            (solver.joint_settled, frames.IDENTITY),
+            (solver.joint_stiffness, 0.0),
+            (solver.joint_damping, 0.0),
+            (solver.body_parent, -1),
+            (solver.body_start, 0.0),
+            (solver.body_end, 0.0),
+            (solver.body_drag, 0.0),
+            (solver.body_load, 0.0),
+            (solver.body_mass, model.body_mass[spare]),
+            (solver.body_com, 0.0),
+            (solver.body_inertia, model.body_inertia[spare]),
+            (self._compliance, 1.0),
+        ):
+            row[spare] = rest
+        solver.ties.join(spare, beyond)
+        self._set_spans(segment)
+        for joint, of in self._joints_on(segment) if beyond == segment else []:
+            if not state.body_cut[joint]:
+                self._adjust_joint(joint, of, turns=True)
+
+    def _restore(self, segment: int) -> None:
+        """Set the parts of a segment from the state, which has their poses already."""
+        solver = self._solver
+        model = solver.model
+        parts = self.parts_of(segment)
+        for body, start, end in parts:
+            self._shape(body, part_of(model, segment, start, end), 1.0)
+        for body, _, end in parts[:-1]:
+            self._attach(body, segment)
+            self._take_joint(body, segment)
+            solver.ties.split(segment, body, end)
+        self._set_spans(segment)
+        for joint, of in [(parts[0][0], segment), *self._joints_on(segment)]:
+            self._adjust_joint(joint, of, turns=False)
+
+    def _take_joint(self, spare: int, segment: int) -> None:
+        """Give a stump the joint of a segment of the model."""
+        solver = self._solver
+        solver.joint_stiffness[spare] = solver.model.joint_stiffness[segment]
+        solver.joint_damping[spare] = solver.model.joint_damping[segment]
+        solver._rest[spare] = solver.model.body_rest[segment]
+        self._compliance[spare] = 1.0
+
+    def _shape(self, body: int, part: Part, share: float) -> None:
+        """Give a body the mass, inertia and drag of a part of a segment; the mass times ``share``."""
+        solver = self._solver
+        solver.body_mass[body] = share * part.mass
+        solver.body_com[body] = part.com
+        solver.body_inertia[body] = share * part.inertia
+        solver.body_product[body] = 0.0
+        solver.body_drag[body] = part.drag
+
+    def _attach(self, spare: int, segment: int) -> None:
+        """Give a stump the place of a segment's joint, and make its tree move it."""
+        solver = self._solver
+        model = solver.model
+        solver.body_parent[spare] = model.body_parent[segment]
+        solver._offset[spare] = model.body_offset[segment]
+        tree = int(model.body_tree[spare])
+        used = spare + 1 - int(model.tree_first[tree])
+        solver.core_moving[tree] = max(int(solver.core_moving[tree]), used)
+        if not solver.state.tree_fine[tree]:
+            solver.tree_moving[tree] = solver.core_moving[tree]
+        solver.launches.set_branching(solver.body_parent)
+
+    def _set_spans(self, segment: int) -> None:
+        for body, start, end in self.parts_of(segment):
+            self._solver.body_start[body] = start
+            self._solver.body_end[body] = end
+        self._solver.buffers.upload(["body_length"] if "body_length" in self._solver.buffers.host else [])
+        state = self._solver.state
+        used = self._spares[state.stump_of[self._spares] >= 0]
+        self.table = np.column_stack([used, state.stump_of[used], state.stump_end[used].astype(float)])
+
+    def _joints_on(self, segment: int) -> list[tuple[int, int]]:
+        """Returns the bodies whose joints are at the tip of a segment, each with the segment of which it is a part."""
+        grown = np.flatnonzero(self._solver.model.body_parent == segment).tolist()
+        return [(self.parts_of(child)[0][0], child) for child in grown]
+
+    def _adjust_joint(self, body: int, segment: int, *, turns: bool) -> None:
+        """Give the joint of ``body``, the first part of a segment, the spring of the wood that meets there. ``turns``:
+        the state has the joint's rotation from the former rest pose."""
+        solver = self._solver
+        model = solver.model
+        state = solver.state
+        own = float(solver.body_end[body]) / float(model.body_length[segment])
+        parent = int(model.body_parent[segment])
+        above = 1.0 - float(solver.body_start[parent]) / float(model.body_length[parent]) if parent >= 0 else 1.0
+        compliance = joint_compliance(model, segment, own, above)
+        ratio = self._compliance[body] / compliance
+        self._compliance[body] = compliance
+        solver.joint_stiffness[body] *= ratio
+        solver.joint_damping[body] *= ratio
+        rest, solver.joint_settled[body] = relaxed_joint(model, segment, compliance)
+        if turns:
+            turn = frames.multiply(frames.conjugate(rest), solver._rest[body].astype(float))
+            state.joint_q[body] = frames.normalize(frames.multiply(turn, state.joint_q[body].astype(float)))
+            state.joint_qd[body] = frames.rotate(turn, state.joint_qd[body].astype(float))
+        solver._rest[body] = rest
+
+
 # Poses of trees that another client simulates.
 
 
@@ -941,6 +1247,10 @@ def blend_towards(
     state.joint_q[bodies] = frames.normalize(frames.multiply(here, frames.exp(blend * turn)))
     state.joint_qd[bodies] = rates
     state.joint_qd[bodies.start + plants.tree_moving[tree] : bodies.stop] = 0.0  # joints of locked clusters do not turn
+    core = bodies.start + int(plants.model.tree_core[tree])
+    unused = slice(bodies.start + int(plants.core_moving[tree]), core)  # the owner's stumps that are not yet known here
+    state.joint_q[unused] = frames.IDENTITY
+    state.joint_qd[unused] = 0.0
 
 
 # Kernels of the articulation solver, each bound once to its arrays, and the transfers of rows around them.
@@ -1132,6 +1442,10 @@ class KernelLaunches:
         apart = (parent >= 0) & (parent != np.arange(len(parent)) - 1)
         places[self.buffers.slots[parent[apart]]] = True
         return places
+
+    def set_branching(self, parent: np.ndarray) -> None:
+        """Change the parents [body] of bodies in the kernels that must know where a tree branches."""
+        self._arrays["body_branches"].assign(self._branching(parent))
 
     def upload_changed(self) -> None:
         """Copy the model's rows (parents, masses, springs) to the device, if :attr:`changed`."""
@@ -1845,7 +2159,7 @@ class Topologies:
         def number(first: int, size: int) -> int:
             return known.setdefault(parent[first : first + size].tobytes(), len(known))
 
-        sizes = (model.tree_core.tolist(), model.tree_size.tolist())
+        sizes = ((model.tree_core - model.tree_spares).tolist(), model.tree_size.tolist())
         first = model.tree_first.tolist()
         self._coarse, self._fine = (np.array([*map(number, first, size)], np.int64) for size in sizes)
 

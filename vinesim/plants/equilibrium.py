@@ -29,7 +29,7 @@ class EquilibriumFinder:
         device = buffers.device
         self._speed, self._distance = (buffers.pinned(np.zeros(trees, np.float32)) for _ in range(2))
         self._is_free = buffers.pinned(np.zeros(trees, bool))
-        buffers.add_body_rows("body_length", buffers.pinned(plants.model.body_length), float)
+        buffers.add_body_rows("body_length", plants.body_end, float)
         for name, data, dtype in (
             ("rest_speed", self._speed, float),
             ("rest_distance", self._distance, float),

@@ -37,7 +37,12 @@ class TieTable:
         self._max_bodies = max_bodies
         self._max_hands = max_hands
         self._model_ties = len(model.tie_body)
-        self._model_body = np.unique(model.tie_body)
+        self.tie_body = model.tie_body.copy()
+        """[tie of the model] The body that each tie holds now. Only a cut changes it: a tie before the cut then holds
+        the stump.
+        """
+        self.changes = 0
+        """Number of cuts that have moved ties to stumps."""
         bodies = len(model.body_mass)
         self._max_model_ties = int(np.bincount(model.tie_body, minlength=bodies).max(initial=0))
         self._span_size = self._max_model_ties + max_hands
@@ -75,7 +80,35 @@ class TieTable:
     @property
     def tied_bodies(self) -> np.ndarray:
         """Bodies with ties [k]."""
-        return np.append(self._model_body, np.array(self.held_bodies, np.int32))
+        return np.append(np.unique(self.tie_body), np.array(self.held_bodies, np.int32))
+
+    def number_on_body(self, ties: np.ndarray) -> np.ndarray:
+        """Returns the number [k] of each of the model's ``ties`` [k] among those of its body, from 0."""
+        return ties - self._model_span[self.tie_body[ties], 0]
+
+    def can_split(self, body: int, at: float) -> bool:
+        """Returns whether the ties of a body before ``at`` [m] stand together in the table, so that :meth:`split` can
+        give them to a stump."""
+        first, end = self._model_span[body].tolist()
+        before = self.point[first:end, 0] < at
+        return not (np.diff(before.astype(int)) != 0).sum() > 1
+
+    def split(self, body: int, stump: int, at: float) -> None:
+        """Give the model's ties of a body before ``at`` [m] to its stump, which has the same frame. Ties of hands stay
+        with the body."""
+        first, end = self._model_span[body].tolist()
+        before = self.point[first:end, 0] < at
+        count = int(before.sum())
+        at_start = count == 0 or before[0]
+        self._model_span[stump] = (first, first + count) if at_start else (end - count, end)
+        self._model_span[body] = (first + count, end) if at_start else (first, end - count)
+        self.tie_body[slice(*self._model_span[stump].tolist())] = stump
+        for one in (body, stump):
+            if one in self._slot_of:
+                self._copy_model_ties(one)
+            else:
+                self.span[one] = self._model_span[one]
+        self.changes += 1
 
     def add(self, body: int, point: np.ndarray, pose: np.ndarray, stiffness: float, damping: float) -> int:
         """Tie the point ``point`` [3] m of a body's frame to its present place in the world. ``pose`` [7]: world pose
@@ -117,10 +150,38 @@ class TieTable:
         if not free:
             raise TieLimitError(f"body {body} is one too many: {self._max_bodies} are held already, let go of one")
         self._slot_of[body] = free[0]
-        own = slice(*self._model_span[body].tolist())
         start = self._model_ties + self._span_size * free[0]
-        here = slice(start, start + own.stop - own.start)
-        for values in (
+        for values in self._rows():
+            values[start : start + self._span_size] = 0.0
+        self._copy_model_ties(body)
+        self.span[body] = start, start + self._span_size
+
+    def join(self, stump: int, body: int) -> None:
+        """Undo :meth:`split`: give a stump's ties of the model to the body beyond it."""
+        ours, theirs = self._model_span[[stump, body]].tolist()
+        if ours[0] < ours[1]:
+            self.tie_body[slice(*ours)] = body
+            joined = [*ours, *theirs] if theirs[0] < theirs[1] else ours
+            self._model_span[body] = min(joined), max(joined)
+        self._model_span[stump] = 0
+        for one in (body, stump):
+            if one in self._slot_of:
+                self._copy_model_ties(one)
+            else:
+                self.span[one] = self._model_span[one]
+        self.changes += 1
+
+    def _copy_model_ties(self, body: int) -> None:
+        """Copy the model's ties of a held body to its span."""
+        own = slice(*self._model_span[body].tolist())
+        start = self._model_ties + self._span_size * self._slot_of[body]
+        for values in self._rows():
+            values[start : start + self._max_model_ties] = 0.0
+            values[start : start + own.stop - own.start] = values[own]
+
+    def _rows(self) -> tuple[np.ndarray, ...]:
+        """Returns the arrays with a row for each tie."""
+        return (
             self.anchor,
             self.anchor_velocity,
             self.axis,
@@ -128,10 +189,7 @@ class TieTable:
             self.stiffness,
             self.damping,
             self.point,
-        ):
-            values[start : start + self._span_size] = 0.0
-            values[here] = values[own]
-        self.span[body] = start, start + self._span_size
+        )
 
 
 class RootRests:

@@ -121,6 +121,12 @@ def _validate_clusters(model: Model) -> None:
     if (bad := (core < 1) | (core > size)).any():
         tree = int(np.argmax(bad))
         raise ValueError(f"tree {tree}: tree_core {core[tree]} of {size[tree]} bodies; give 1 to tree_size (all)")
+    spares = model.tree_spares
+    if (bad := (spares < 0) | (spares >= core)).any():
+        tree = int(np.argmax(bad))
+        raise ValueError(
+            f"tree {tree}: tree_spares {spares[tree]} of {core[tree]} core bodies; give 0 to less than all"
+        )
     riding = np.arange(len(model.body_mass)) - model.tree_first[model.body_tree] >= core[model.body_tree]
     owner = np.full(len(model.body_mass), -1)
     for bunch in np.flatnonzero(model.bunch_clusters > 0).tolist():

@@ -47,6 +47,9 @@ class Model(StructOfArrays):
     """Number of bodies in the tree's core, which come first. The other bodies are berry clusters: while no actor is
     close, the clusters of a bunch are fused to it as one *compound*, and only the core is simulated. A tree without
     clusters is all core."""
+    tree_spares: np.ndarray = array("tree", unit="1", dtype=np.int32)
+    """Number of spare bodies, the last ones of the core. A spare has no wood and carries nothing until a cut makes it a
+    stump; see :mod:`vinesim.scene.spare_bodies`."""
 
     # bodies
     body_tree: np.ndarray = array("body", unit="1", dtype=np.int32)
@@ -120,6 +123,10 @@ class Model(StructOfArrays):
     """Blade frame in the body's frame: origin where petiole meets blade, x along the midrib, z the upper side."""
     leaf_size: np.ndarray = array("leaf", unit="m")
     """About half of the blade's width; it scales the outline, whose area is ``leaves.BLADE_AREA`` in this unit."""
+    leaf_mass: np.ndarray = array("leaf", unit="kg")
+    """Mass of the leaf, a point mass at the origin of ``leaf_pose``. It is a part of ``body_mass``."""
+    leaf_drag: np.ndarray = array("leaf", unit="m^2")
+    """Drag area of the leaf. It is a part of ``body_drag``."""
     leaf_age: np.ndarray = array("leaf", unit="1")
     """Age from 0 (young and green) to 1 (yellow)."""
 
@@ -205,6 +212,12 @@ class Model(StructOfArrays):
             owner[body] = bunch
             body = self.body_parent[body]
         return owner
+
+    def is_spare(self) -> np.ndarray:
+        """Returns whether each body is a spare, which has no wood until a cut makes it a stump [body] bool."""
+        number = np.arange(len(self.body_mass)) - self.tree_first[self.body_tree]
+        core = self.tree_core[self.body_tree]
+        return (number < core) & (number >= core - self.tree_spares[self.body_tree])
 
     def variety_of_trees(self) -> np.ndarray:
         """[tree] Variety of each tree's vine, as an index into ``vinesim.scene.berries.VARIETIES``: that of the vine's

@@ -39,6 +39,11 @@ class State(StructOfArrays):
     joint."""
     cut_at: np.ndarray = array("bunch", unit="m")
     """Distance of that cut from the segment's origin."""
+    stump_of: np.ndarray = array("body", unit="1", dtype=np.int32, fill=-1)
+    """For a spare body that a cut has made a stump: the body that was cut, of which it was the part before the cut. -1
+    for all other bodies. A stump has the frame of that body."""
+    stump_end: np.ndarray = array("body", unit="m")
+    """Distance of that cut from the origin of the frame, where the stump ends; 0 for all other bodies."""
 
     @classmethod
     def at_rest(cls, model: Model) -> State:

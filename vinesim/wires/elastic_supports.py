@@ -78,6 +78,8 @@ class ElasticSupports:
         self._loaded = self._unloaded = _NO_SUPPORTS
         self.load = np.zeros((len(self._tree), 3))
         """[node, 3] N: forces of contacts on the nodes of wires. The forces of ties are not included."""
+        self._wire_ties = wires["tie"]
+        self._tie_changes = 0
         first_tie = np.searchsorted(model.tie_body, model.tie_body[wires["tie"]])
         stiffness, last_stiffness = _springs_in_series(nodes["compliance"], nodes["whole"], nodes["is_arm"], first)
         self._bind(
@@ -141,7 +143,8 @@ class ElasticSupports:
             "root_turn_rate": rests.rate,
             "root_softening": rests.softening,
         }
-        node_struct = SharedArrays(kernels.SupportNodes, **nodes).struct
+        self._nodes = SharedArrays(kernels.SupportNodes, **nodes)
+        node_struct = self._nodes.struct
         body_struct = SharedArrays(kernels.SupportedBodies, **bodies).struct
         spring_struct = SharedArrays(kernels.SupportedSprings, **springs).struct
         solve = KernelLaunch(
@@ -197,6 +200,8 @@ class ElasticSupports:
         """
         plants = self._plants
         awake = self._plants.awake
+        if plants.ties.changes != self._tie_changes:
+            self._follow_stumps()
         if awake is not self._awake:
             self.place(self._awake)  # a tree that fell asleep was moved to its rest pose
             self._awake = awake
@@ -217,6 +222,19 @@ class ElasticSupports:
             moved = np.flatnonzero(self._is_moved).astype(np.int32)
             self._is_moved[moved] = False
             plants.wake(moved)
+
+    def _follow_stumps(self) -> None:
+        """Find the bodies that ties hold and on which trees stand, after cuts have left stumps."""
+        plants = self._plants
+        self._tie_changes = plants.ties.changes
+        nodes = self._nodes
+        count = len(self._wire_ties)
+        nodes.body[:count] = plants.ties.tie_body[self._wire_ties]
+        nodes.number[:count] = plants.ties.number_on_body(self._wire_ties)
+        for node, tree in enumerate(self._tree[count:].tolist(), count):
+            root = plants.stumps.parts_of(int(plants.model.tree_first[tree]))[0][0]
+            nodes.body[node] = root
+            nodes.origin[node] = frames.log(plants.joint_settled[root].astype(float))
 
     def _list_supports(self) -> None:
         """List the supports (wires and arms) of the trees that are awake or marked by :meth:`place`, and find the awake

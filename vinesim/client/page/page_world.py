@@ -130,6 +130,7 @@ class PageWorld:
         since pages loaded the primitives. Only indicator lights change these. Every state for a page contains the
         present colours of the primitives marked here, so that the page also shows when a light goes out."""
         self._visuals: tuple[Any, ...] | None = None
+        self._stumps = np.zeros((0, 3))
         client.after_reset.append(self._follow_reset)
         self._driver: int | None = None
         """The page that controls the spectator's eyes or the person: the first page that sends a message, with a person
@@ -328,7 +329,7 @@ class PageWorld:
         if newest is None or self._primitives is None or newest[0] <= since:
             return None
         tick, snapshot = newest
-        if snapshot.visuals is not self._visuals:
+        if snapshot.visuals is not self._visuals or not np.array_equal(snapshot.stumps, self._stumps):
             self._follow_visuals(self._primitives, snapshot)
         body = self._bodies(np.flatnonzero(self._moved_at > since))
         wire = np.flatnonzero(self._wire_moved_at > since)
@@ -380,7 +381,9 @@ class PageWorld:
         self._visuals = snapshot.visuals
         rows = slice(primitives.plant_count, primitives.count)
         columns = _columns(primitives, rows)
-        if before is None or not _differ_in_lights_only(before, snapshot.visuals):
+        is_cut = not np.array_equal(snapshot.stumps, self._stumps)
+        self._stumps = snapshot.stumps
+        if before is None or is_cut or not _differ_in_lights_only(before, snapshot.visuals):
             self._lay_out_rigid(primitives, snapshot, rows)
             self._laid_out = columns
             self._has_shone = np.zeros(len(columns["material"]), bool)
@@ -396,12 +399,14 @@ class PageWorld:
     def _lay_out_rigid(self, primitives: Primitives, snapshot: Snapshot, rows: slice) -> None:
         self._rigid_version += 1
         clusters = slice(len(primitives.cluster_first) - len(primitives.rigid_clusters), None)
-        stumps = _columns(primitives, primitives.stump_rows)
+        keys = np.array(primitives.stump_keys, np.float32).reshape(-1, 5)
+        stumps = _columns(primitives, keys[:, 0].astype(np.int64))
         self._rigid = array_message.encode(
             {"version": self._rigid_version, "names": [visual.name for visual in snapshot.visuals]},
             _columns(primitives, rows)
             | _clusters(primitives, clusters, primitives.plant_count)
-            | {"stump_shape": stumps["shape"], "stump_carrier": stumps["carrier"]},
+            | {f"stump_{name}": values for name, values in stumps.items()}
+            | {"stump_key": keys[:, 1:]},
         )
 
     def take(self, page: int, said: PageInput) -> None:
@@ -542,7 +547,7 @@ def _within_reach(model: Model) -> dict[str, np.ndarray]:
     They contain bodies of wood with their lengths [m], and for each bunch its body, length and radius [m], and the last
     segment of its peduncle.
     """
-    wood = np.flatnonzero(np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE)))
+    wood = np.flatnonzero(np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE)) & ~model.is_spare())
     stalk = model.body_parent[model.bunch_body]
     return {
         "wood": wood.astype(np.uint32),

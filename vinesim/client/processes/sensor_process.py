@@ -243,6 +243,9 @@ class SensorProcess:
             shared["body_q"][bodies] = physics.state.body_q[bodies]
             shared["tree_number"][trees] = shared["number"][0] = self._snapshot_count
             shared["bunch_attached"][:] = physics.state.bunch_attached
+            stumps = physics.plants.stumps.table
+            shared["stump_count"][0] = len(stumps)
+            shared["stumps"][: len(stumps)] = stumps
             wires = physics.wire_shapes.poses()
             shared["wire_count"][0] = moved = len(wires.segment)
             shared["wire_segment"][:moved], shared["wire_q"][:moved] = wires.segment, wires.q

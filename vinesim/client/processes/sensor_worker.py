@@ -131,6 +131,8 @@ class SensorChannel:
                 "visual_count": ((1,), "i8"),
                 "body_q": ((bodies, 7), "f4"),
                 "bunch_attached": ((bunches,), "?"),
+                "stump_count": ((1,), "i8"),
+                "stumps": ((int(model.tree_spares.sum()), 3), "f8"),
                 "wire_count": ((1,), "i8"),
                 "wire_segment": ((wires,), "i8"),
                 "wire_q": ((wires, 7), "f4"),
@@ -251,6 +253,7 @@ class SensorWorker(Worker):
         self._digests = {name: hashlib.blake2b(digest_size=16) for name in config.sensor_frames}
         """Digest of all frames that each sensor has delivered in lockstep, by the sensor's name."""
         self._time = self._frame_score = 0.0  # of the newest snapshot
+        self._stumps = np.zeros((0, 3))
         self._awaits("kernels and scene")
         self.node = self._open_node(stack) if config.ros else None
         if self.node is not None:
@@ -449,6 +452,7 @@ class SensorWorker(Worker):
                     shared["tree_drawn"].copy(),
                 )
             self._state.bunch_attached[:] = shared["bunch_attached"]
+            self._stumps = shared["stumps"][: int(shared["stump_count"][0])].copy()
             self._frame_score = float(shared["frame_score"][0])
             self._time = time = float(shared["time"][0])
             tick = int(shared["tick"][0])
@@ -472,6 +476,7 @@ class SensorWorker(Worker):
             np.flatnonzero(has_moved),
             wind,
             wire_poses,
+            self._stumps,
         )
         return snapshot, [(float(t), dict(zip(names, q, strict=True))) for t, q in zip(times, poses, strict=True)]
 

@@ -10,7 +10,6 @@ from collections.abc import Callable, Collection, Container, Iterable
 
 import numpy as np
 
-from vinesim.interaction.stalk import PLACE_STEP
 from vinesim.interaction.support_tracking import GROUND
 from vinesim.net.codec.control import RetainedRecord
 from vinesim.net.codec.trees import decode_trees
@@ -19,6 +18,7 @@ from vinesim.net.replication.authority import wins
 from vinesim.net.replication.receiver import Inbox
 from vinesim.net.replication.streams import NO_ROOTS, DetachedRoots
 from vinesim.scene.ids import ObjectKind, is_tree, object_id, parse_object_name, split_object_id
+from vinesim.scene.spare_bodies import PLACE_STEP
 from vinesim.scene.values import Detachment, ObjectUpdate, TreeUpdate
 from vinesim.world import Physics
 
@@ -161,7 +161,10 @@ class ObjectSync:
                     self._let_fall(self._resting[number], is_known=False)
 
     def _apply_cuts(self, record: RetainedRecord) -> None:
-        """Cut off the bodies that the record of a tree names."""
+        """Cut off the bodies that the record of a tree names, and leave the stumps that it names."""
+        for stump, segment, steps in sorted(record.stumps, key=lambda stump: stump[1:]):  # from the joint to the tip
+            self.physics.apply_remote_stump(stump, segment, PLACE_STEP * steps, floats=stump in record.cut)
+            self._changed_trees.add(record.object)
         for body in record.cut:
             if self.physics.model.body_tree[body] == record.object and not self.physics.state.body_cut[body]:
                 self.apply_remote_cut(body)
@@ -172,6 +175,15 @@ class ObjectSync:
         kind, bunch = split_object_id(number)
         if kind == ObjectKind.BUNCH:
             self.physics.apply_remote_stalk(bunch, segment, PLACE_STEP * steps)
+
+    def stumps_of(self, tree: int) -> tuple[tuple[int, int, int], ...]:
+        """Returns the stumps of a tree, as its record names them."""
+        state = self.physics.state
+        bodies = self.physics.model.bodies_of(tree)
+        return tuple(
+            (stump, int(state.stump_of[stump]), round(float(state.stump_end[stump]) / PLACE_STEP))
+            for stump in (bodies.start + np.flatnonzero(state.stump_of[bodies] >= 0)).tolist()
+        )
 
     def stalk_of(self, number: int) -> tuple[int, int] | None:
         """Returns where a bunch was cut in its peduncle, as its record names it; None without a stalk."""
@@ -286,6 +298,8 @@ class ObjectSync:
         state = self.physics.state
         first = int(self.physics.model.tree_first[update.tree])
         for body, x, xd in zip((first + update.root).tolist(), update.root_x, update.root_xd, strict=True):
+            if plants.body_end[body] == 0.0:  # the record that makes it a stump has not arrived yet
+                continue
             if not state.body_cut[body]:
                 self.apply_remote_cut(body)
                 state.joint_x[body] = x
@@ -430,10 +444,8 @@ class ObjectSync:
 
     def _record_cut(self, body: int) -> None:
         tree = int(self.physics.model.body_tree[body])
-        bodies = self._cut_bodies.setdefault(tree, [])
-        if body not in bodies:
-            bodies.append(body)
-            bodies.sort()
+        here = self.physics.model.bodies_of(tree)
+        self._cut_bodies[tree] = (here.start + np.flatnonzero(self.physics.state.body_cut[here])).tolist()
         self._changed_trees.add(tree)
 
     def _tree_of(self, bunch: int) -> int:

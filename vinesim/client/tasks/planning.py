@@ -271,7 +271,7 @@ def _obstacles(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     body_q = model.forward_kinematics(model.joint_settled).astype(float)
     owner = model.bunch_of_body()
-    wood = np.flatnonzero(np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE)))
+    wood = np.flatnonzero(np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE)) & ~model.is_spare())
     share = np.linspace(0.0, 1.0, 4)
     along = share[None] * model.body_length[wood, None]
     axis = frames.rotate(body_q[:, 3:], np.array([1.0, 0.0, 0.0]))

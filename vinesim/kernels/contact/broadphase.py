@@ -70,8 +70,8 @@ def next_overlap(
 @wp.func
 def exists_at_level(level: int, is_fine: bool):
     """Returns whether a capsule exists at its tree's level of detail. ``level``: 0 always, 1 while the tree is coarse,
-    2 while the tree is fine."""
-    return level == 0 or (level == 2) == is_fine
+    2 while the tree is fine, 3 never."""
+    return level == 0 or level == wp.where(is_fine, 2, 1)
 
 
 @wp.func

@@ -127,6 +127,9 @@ class RetainedRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknow
     stalk: tuple[int, int] | None = None
     """For a bunch that was cut in its peduncle: body of the segment in which it was cut, and place of the cut along it
     [0.1 mm]."""
+    stumps: tuple[tuple[int, int, int], ...] = ()
+    """Stumps that cuts of the tree's canes have left, in increasing order: body of the stump, segment that was cut, and
+    place of the cut along it [0.1 mm]."""
 
     @property
     def claim(self) -> Claim:
@@ -256,6 +259,10 @@ def decode_records(payload: bytes, counts: tuple[int, ...] | None = None) -> lis
             raise MessageError(f"record of object {record.object} with an impossible parent or list of cut bodies")
         if record.stalk is not None and not (record.stalk[0] >= 0 and 0 < record.stalk[1] < 1 << 16):
             raise MessageError(f"record of object {record.object} with an impossible stalk {record.stalk}")
+        if len(record.stumps) > MAX_BODIES or any(
+            body < 0 or segment < 0 or not 0 < place < 1 << 16 for body, segment, place in record.stumps
+        ):
+            raise MessageError(f"record of object {record.object} with impossible stumps {record.stumps[:4]}")
     return records
 
 

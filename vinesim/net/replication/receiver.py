@@ -27,8 +27,9 @@ from vinesim.net.replication.authority import NO_OWNER, Claim
 from vinesim.net.replication.interest import Cell
 from vinesim.net.replication.replication_state import SPECTATOR, ReplicationState, put_counted
 from vinesim.net.transport.bus import Reply
-from vinesim.scene.ids import is_tree, parse_object_name
+from vinesim.scene.ids import Organ, is_tree, parse_object_name
 from vinesim.scene.model import Model
+from vinesim.scene.spare_bodies import PLACE_STEP
 from vinesim.scene.values import HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpdate
 
 MAX_EARLY_MESSAGES = 100
@@ -329,7 +330,7 @@ def check_record(record: RetainedRecord, model: Model, counts: tuple[int, ...]) 
     """
     if is_tree(record.object):
         _check_tree_record(record, model)
-    elif record.cut or record.trees:
+    elif record.cut or record.trees or record.stumps:
         raise MessageError(f"record of object {record.object} with cuts or the state of a tree; it is none")
     parent = parse_object_name(record.parent)
     if parent is not None:
@@ -346,11 +347,27 @@ def _check_tree_record(record: RetainedRecord, model: Model) -> None:
     wrong = next((body for body in record.cut if not first <= body < first + core), None)
     if wrong is not None:
         raise MessageError(f"record of tree {tree} cut at body {wrong}; it has wood from {first} to {first + core - 1}")
+    for stump, segment, place in record.stumps:
+        _check_stump(record, stump, segment, PLACE_STEP * place, model)
     if record.trees:
         states = decode_trees(record.trees, model.tree_size)
         if states.tree.tolist() != [tree]:
             raise MessageError(f"record of tree {tree} with the state of {states.tree.tolist()}")
         check_tree_states(states, model)
+
+
+def _check_stump(record: RetainedRecord, stump: int, segment: int, place: float, model: Model) -> None:
+    """Raise :class:`MessageError` if a stump in a record of a tree contradicts the model. ``place`` [m]: of its cut."""
+    first = int(model.tree_first[record.object])
+    spares = first + int(model.tree_core[record.object]) - int(model.tree_spares[record.object])
+    if not spares <= stump < spares + int(model.tree_spares[record.object]):
+        raise MessageError(f"record of tree {record.object} with the stump {stump}, which is no spare body")
+    if not first <= segment < spares or model.body_organ[segment] != int(Organ.CANE) or segment not in record.cut:
+        raise MessageError(
+            f"record of tree {record.object} with a stump of body {segment}, which is no cane that was cut"
+        )
+    if not 0.0 < place < float(model.body_length[segment]):
+        raise MessageError(f"record of tree {record.object} cut {place:.4g} m along body {segment}, beyond its end")
 
 
 def check_tree_states(states: TreeStates, model: Model) -> None:

@@ -222,6 +222,7 @@ class Replicator:
         messages: Mapping[int, Any] = MappingProxyType({}),
         carried_on: Iterable[int] = (),
         stalk_of: Callable[[int], tuple[int, int] | None] = lambda _: None,
+        stumps_of: Callable[[int], tuple[tuple[int, int, int], ...]] = lambda _: (),
     ) -> list[TreeUpdate]:
         """Publish the results of one step. Returns the states of trees at rest that were sent, as all receivers decode
         them.
@@ -245,6 +246,7 @@ class Replicator:
           again, with the present place.
         * ``stalk_of(object_id)``: where a bunch was cut in its peduncle
           (:attr:`vinesim.net.codec.control.RetainedRecord.stalk`).
+        * ``stumps_of(tree)``: the stumps of a tree (:attr:`vinesim.net.codec.control.RetainedRecord.stumps`).
         """
         state = self._state
         self._follow_clock()
@@ -273,6 +275,7 @@ class Replicator:
                 has_body,
                 carried_on,
                 stalk_of,
+                stumps_of,
             )
         )
 

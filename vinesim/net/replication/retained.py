@@ -3,8 +3,9 @@
 A last-writer-wins map. Merging is a join of a semilattice: equal sets of records result in equal maps, in whatever
 order and however often the records arrive. Of two records of one object the one with the greater claim is kept
 (:func:`authority.wins`). An author therefore never publishes two different records with the same claim. Cuts
-accumulate: the record that is kept also takes over the cuts of the other one. The server keeps one map for each world,
-and every client keeps a map of the records that it has received.
+accumulate: the record that is kept also takes over the cuts and stumps of the other one. If two records name the same
+body as stumps of different cuts, the lower segment and the lower place are kept. The server keeps one map for each
+world, and every client keeps a map of the records that it has received.
 Source: M. Shapiro et al., Conflict-free Replicated Data Types, 2011.
 """
 
@@ -33,14 +34,17 @@ class RetainedState:
             self._put(cell, record)
             return True
         cuts = tuple(sorted({*held.cut, *record.cut}))
+        stumps = _joined_stumps(held.stumps, record.stumps)
         if authority.wins(record.claim, held.claim):
             self._records[self._cell_of[record.object]].pop(record.object)
-        elif cuts != held.cut:
+        elif (cuts, stumps) != (held.cut, held.stumps):
             cell = self._cell_of[record.object]
             record = held
         else:
             return False
-        self._put(cell, record if cuts == record.cut else msgspec.structs.replace(record, cut=cuts))
+        if (cuts, stumps) != (record.cut, record.stumps):
+            record = msgspec.structs.replace(record, cut=cuts, stumps=stumps)
+        self._put(cell, record)
         return True
 
     def get(self, object_id: int) -> RetainedRecord | None:
@@ -65,3 +69,15 @@ class RetainedState:
     def _put(self, cell: Cell, record: RetainedRecord) -> None:
         self._cell_of[record.object] = cell
         self._records.setdefault(cell, {})[record.object] = record
+
+
+def _joined_stumps(
+    one: tuple[tuple[int, int, int], ...], other: tuple[tuple[int, int, int], ...]
+) -> tuple[tuple[int, int, int], ...]:
+    """Returns the stumps of two records. Of two cuts that name the same stump, the lower segment and place is kept."""
+    if one == other or not other:
+        return one
+    kept: dict[int, tuple[int, int, int]] = {}
+    for stump in sorted({*one, *other}):
+        kept.setdefault(stump[0], stump)
+    return tuple(kept.values())

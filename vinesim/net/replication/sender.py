@@ -58,6 +58,7 @@ class LocalStep:
     has_body: Callable[[int], bool]
     carried_on: set[int]
     stalk_of: Callable[[int], tuple[int, int] | None]
+    stumps_of: Callable[[int], tuple[tuple[int, int, int], ...]]
 
 
 class Sender:
@@ -345,10 +346,11 @@ class Sender:
         state.retained.publish(state.object_stream.cells((object_id,))[0], record)
 
     def _publish_tree_record(self, cell: Cell, record: RetainedRecord, step: LocalStep) -> None:
-        """Add all bodies that were cut off a tree to its retained record, and publish the record."""
+        """Add all bodies that were cut off a tree, and all stumps, to its retained record, and publish the record."""
         first = int(self._state.model.tree_first[record.object])
         cut = tuple((first + step.detached_roots(record.object)[0]).tolist())
-        self._state.retained.publish(cell, msgspec.structs.replace(record, cut=cut))
+        record = msgspec.structs.replace(record, cut=cut, stumps=step.stumps_of(record.object))
+        self._state.retained.publish(cell, record)
 
     def _encode_tree(self, tree: int, claim: Claim, step: LocalStep, flags: int) -> tuple[bytes, TreeUpdate]:
         """Encode the state of a tree. Returns the message, and the state as receivers decode it.

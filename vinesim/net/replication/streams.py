@@ -18,6 +18,7 @@ from vinesim.net.codec.trees import RESTING, TreeStates, encode_trees
 from vinesim.net.replication import dead_reckoning, interest
 from vinesim.net.replication.authority import Claim
 from vinesim.net.replication.interest import Cell
+from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.values import ObjectUpdate, TreeUpdate
 
@@ -295,6 +296,9 @@ def _tree_centres(model: Model) -> np.ndarray:
 def _lever_arms(model: Model) -> np.ndarray:
     """Returns the largest distance from the joint of each body to the end of a body that it carries [body] m."""
     reach = model.body_length.astype(float).copy()
+    reach[model.is_spare()] = model.body_length[model.body_organ == int(Organ.CANE)].max(
+        initial=0.0
+    )  # if it is a stump
     for body in range(len(reach) - 1, -1, -1):
         parent = model.body_parent[body]
         if parent >= 0:

@@ -42,6 +42,7 @@ from vinesim.scene.plant_import.ties import tie_to_wires
 from vinesim.scene.plant_import.wood import build_model, join_models
 from vinesim.scene.plant_parameters import VineParameters
 from vinesim.scene.season import SeasonState, load_season
+from vinesim.scene.spare_bodies import with_spares
 from vinesim.scene.spec import Clutter, Datum, Scene, Sun, Wind, on_its_date, season_of
 from vinesim.scene.terrain import Terrain, ground_height
 
@@ -148,7 +149,7 @@ def _generate(scene: Scene, parameters: VineParameters, terrain: Terrain | None)
             (scene, rng) if one.leaves else None,
         )
         model = join_models(model, tie_to_wires(plant, model, one.tie_gap, parameters.trellis))
-    return model
+    return with_spares(model)
 
 
 def _build_leafy(
@@ -270,7 +271,8 @@ def _assemble_model(
     model.leaf_body[:] = carrier
     model.leaf_base[:] = leaf["base"][shown]
     model.leaf_pose[:] = leaf["pose"][shown]
-    model.leaf_age[:] = leaf["age"][shown]
+    for name in ("age", "mass", "drag"):
+        getattr(model, f"leaf_{name}")[:] = leaf[name][shown]
     model.leaf_size[:] = np.sqrt(leaf["area"][shown] / leaves.BLADE_AREA)
 
     for name, value in structure.fixed.items():

@@ -384,5 +384,7 @@ def add_leaves(
                 "pose": grown["pose"][i],
                 "age": grown["age"][i],
                 "size": size[i],
+                "mass": grown["mass"][i],
+                "drag": grown["drag"][i],
             }
         )

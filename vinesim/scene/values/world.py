@@ -63,6 +63,9 @@ class Snapshot:
     (motion in the wind) of all other trees, which :mod:`vinesim.wind.sway` adds for rendering."""
     wires: SegmentPoses = dataclasses.field(default_factory=SegmentPoses)
     """Poses of displaced segments of wires; all other segments have their rest poses."""
+    stumps: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+    """[k, 3] Stumps that cuts of canes have left: body of the stump, segment that was cut, and distance of the cut from
+    the segment's origin [m]. The stump has the segment's frame."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -100,7 +103,8 @@ class Detachment:
     moment: np.ndarray
     """[3] N m, last moment about the joint on the detached part."""
     segment: int = -1
-    """Index of the body of the peduncle in which a blade has cut a bunch off; -1: the part was detached at its joint.
+    """Index of the body of wood that was cut: a segment of the peduncle of a bunch, or the body of a cane, which is the
+    root of what falls. -1: the part was detached at its joint.
     """
     at: float = 0.0
     """[m] Distance of the cut from the origin of ``segment``."""

@@ -19,6 +19,8 @@ from vinesim.sensors.raster.primitive_arrays import CONE, LEAF
 
 STEM_TINT = DEFAULT.wood.stem
 """Colour [linear RGB reflectance] of the rachis and the stalks of berries."""
+UNSEEN = 1e-6
+"""Radius and length [m] with which wood is drawn that is not there: too small to be seen."""
 _YOUNG = 0.15
 _YOUNGEST = 0.03
 """Ages (:attr:`Model.leaf_age`) between which a leaf's colour changes from young to grown. GUESSED."""
@@ -50,12 +52,14 @@ def cane_batch(model: Model) -> Batch:
     tint = (1.0 - green) * np.array(wood.cane) * (0.7 + 0.6 * seed[tree, None]) + green * np.array(wood.stem)
     material = np.where(green[:, 0] > 0.5, int(materials.STEM), int(materials.CANE))
     material, tint = wood_looks(model, bodies, material, tint)
-    length = model.body_length[bodies]
+    is_spare = model.is_spare()[bodies]  # a spare is drawn when a cut has made it a stump
+    length = np.where(is_spare, UNSEEN, model.body_length[bodies])
+    radius = np.where(is_spare[:, None], UNSEEN, model.body_radius[bodies])
     zero = np.zeros(len(bodies))
     return make_batch(
         CONE,
-        stack_columns(zero, zero, zero, model.body_radius[bodies, 0]),
-        b=stack_columns(length, zero, zero, model.body_radius[bodies, 1]),
+        stack_columns(zero, zero, zero, radius[:, 0]),
+        b=stack_columns(length, zero, zero, radius[:, 1]),
         c=stack_columns(zero, seed[tree] * 7.0, zero, zero),
         material=material,
         tint=tint,

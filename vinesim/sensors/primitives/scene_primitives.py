@@ -65,6 +65,8 @@ seen."""
 _ONLY_IN_COLUMNS = ("a", "b", "c", "d", "material", "tint", "organ", "label", "carrier")
 """Fields of :class:`ClusterLayout` with a value for each primitive; after loading they are only in the device's
 columns."""
+_CUT_COLUMNS = ("local_a", "local_b", "local_c", "tint", "material", "sky", "carrier")
+"""Columns of primitives that a cut of a cane changes."""
 _CLUSTER_COLUMNS = {**dict.fromkeys(("first", "size", "cluster_kind", "shown"), wp.int32), "ball": wp.vec4}
 """Columns of the table of clusters: name -> type."""
 _TEXTURES = (
@@ -123,6 +125,13 @@ class Primitives:
         """Primitives [k] of plants that a cut has ever shortened, ascending."""
         self._stump_trees = np.zeros(0, np.int64)
         """Trees [k] whose stumps the last change of rigid bodies has changed."""
+        self.stump_keys: list[tuple[int, int, float, float, float]] = []
+        """Each carrier and place that the primitives in :attr:`stump_rows` have had: primitive, carrier, and first
+        point in the carrier's frame [m]. Pages know primitives by them."""
+        self._cuts = np.zeros((0, 3))
+        """``Snapshot.stumps`` as drawn."""
+        self._whole: dict[int, dict[str, np.ndarray]] = {}
+        """Columns of the primitives that cuts of canes have changed, before the cuts, by primitive."""
         self._rigid: dict[tuple[Organ, int, int], tuple[tuple[Shape, ...], ClusterLayout | None]] = {}
         """Shapes and clusters of each rigid body, by organ, index and identity of the tuple of shapes."""
         self._moved = np.zeros(0, np.int64)
@@ -352,7 +361,82 @@ class Primitives:
                         start[3] = shown[3] = _NOTHING
                     for column, value in zip(ends, (start, shown), strict=True):
                         column[row : row + 1].assign(value[None])
-            self.stump_rows = np.union1d(self.stump_rows, list(kept))
+            self._know([*kept])
+
+    def _draw_cut_canes(self, cuts: np.ndarray) -> np.ndarray:
+        """Draw canes as cut by ``cuts`` [k, 3] (``Snapshot.stumps``): the wood of each stump and of the part beyond,
+        and the leaves on the stump. Returns the trees [k] that have changed."""
+        trees = self.model.body_tree[np.concatenate([self._cuts, cuts])[:, 0].astype(int)]
+        self._cuts = cuts.copy()
+        for row, columns in self._whole.items():
+            for name, value in columns.items():
+                self._columns[name][row : row + 1].assign(value)
+        self._whole = {}
+        carrier = self._columns["carrier"][: self.plant_count].numpy()
+        rows = np.flatnonzero(np.isin(carrier, cuts[:, :2].astype(int)))
+        whole = {name: self._columns[name].numpy()[rows] for name in _CUT_COLUMNS}
+        drawn = {name: values.copy() for name, values in whole.items()}
+        base = self._growth_places(rows, whole)
+        for segment in np.unique(cuts[:, 1]).astype(int).tolist():
+            stumps = cuts[cuts[:, 1] == segment]
+            stumps = stumps[np.argsort(stumps[:, 2])]
+            here = np.flatnonzero(whole["carrier"] == segment)
+            wood = here[np.isnan(base[here])]
+            edges = [0.0, *stumps[:, 2].tolist(), float(self.model.body_length[segment])]
+            for body, start, end in zip([*stumps[:, 0].astype(int).tolist(), segment], edges, edges[1:], strict=False):
+                own = np.flatnonzero(whole["carrier"] == body) if body != segment else wood
+                for name in _CUT_COLUMNS if len(wood) else ():
+                    if name != "carrier":
+                        drawn[name][own] = whole[name][wood[:1]]
+                if len(wood):
+                    first, last = (whole[f"local_{name}"][wood[0]] for name in "ab")
+                    for name, at in (("local_a", start), ("local_b", end)):
+                        drawn[name][own] = first + (at / edges[-1]) * (last - first)
+                drawn["carrier"][here[(start <= base[here]) & (base[here] < end)]] = body
+        changed = np.flatnonzero(np.any([(drawn[n] != whole[n]).reshape(len(rows), -1).any(1) for n in drawn], axis=0))
+        for k in changed.tolist():
+            row = int(rows[k])
+            self._whole[row] = {name: values[k : k + 1].copy() for name, values in whole.items()}
+            for name in drawn:
+                self._columns[name][row : row + 1].assign(drawn[name][k : k + 1])
+        self._know([*self._whole])
+        return trees
+
+    def _growth_places(self, rows: np.ndarray, columns: dict[str, np.ndarray]) -> np.ndarray:
+        """Returns where the primitives ``rows`` [k] of plants grow along the bodies that carry them [k] m; NaN for the
+        wood of the bodies themselves. ``columns``: columns of these primitives."""
+        model = self.model
+        start, end = columns["local_a"], columns["local_b"]
+        carrier = columns["carrier"]
+        place = start[:, 0].astype(float)
+        organ, material = (self._columns[name].numpy()[rows] for name in ("organ", "material"))
+        is_wood = (organ == int(Organ.CANE)) & (start[:, :3] == 0.0).all(1) & (end[:, 1:3] == 0.0).all(1)
+        place[is_wood] = np.nan
+        is_node = (organ == int(Organ.CANE)) & (material == int(materials.CANE)) & ~is_wood
+        place[is_node] += 7.0 / 11.0 * (end[is_node, 0] - start[is_node, 0])
+        for body in np.unique(carrier).tolist():
+            leaves = np.flatnonzero(model.leaf_body == body)
+            here = np.flatnonzero((carrier == body) & (material == int(materials.FOLIAGE)))
+            if len(leaves) and len(here):
+                away = np.linalg.norm(start[here, None, :3] - model.leaf_pose[leaves, :3], axis=-1)
+                nearest = away.argmin(1)
+                on = away[np.arange(len(here)), nearest] < 1e-5
+                place[here[on]] = model.leaf_base[leaves[nearest[on]], 0]
+        return place
+
+    def _know(self, rows: list[int]) -> None:
+        """Add the present places of primitives of plants to :attr:`stump_keys`, and those before cuts."""
+        known = set(self.stump_keys)
+        carrier, first = (self._columns[name].numpy() for name in ("carrier", "local_a"))
+        for row in rows:
+            keys = [(row, int(carrier[row]), *first[row, :3].tolist())]
+            if row in self._whole:
+                keys.append((row, int(self._whole[row]["carrier"][0]), *self._whole[row]["local_a"][0, :3].tolist()))
+            for key in keys:
+                if key not in known:
+                    known.add(key)
+                    self.stump_keys.append(key)
+        self.stump_rows = np.union1d(self.stump_rows, rows).astype(np.int64)
 
     def _segments_below(self, stalk: Stalk) -> list[int]:
         """Returns the segments of a peduncle from the one that was cut to the bunch."""
@@ -473,6 +557,8 @@ class Primitives:
             differs = (np.asarray(body_q, np.float32) != self._poses[: self._bodies]).any(1)
             trees = np.union1d(trees, self.model.body_tree[differs])
             trees = np.union1d(trees, self._stump_trees)
+        if not np.array_equal(snapshot.stumps, self._cuts):
+            trees = np.union1d(trees, self._draw_cut_canes(np.asarray(snapshot.stumps, float)))
         attached = np.asarray(snapshot.bunch_attached, bool)
         changed = np.flatnonzero(attached != self._attached)
         if len(changed):

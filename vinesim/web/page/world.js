@@ -297,13 +297,29 @@ export class World {
     this.listedAt = null;
   }
 
-  /** Set the shapes of peduncles that were cut, or are whole again. A segment of a peduncle is one primitive. */
-  drawStumps({ stump_shape, stump_carrier }) {
+  /**
+   * Set the primitives of wood that was cut, or is whole again, and of its leaves. A key is a carrier and a first point
+   * that a primitive has had.
+   */
+  drawStumps({ stump_shape, stump_surface, stump_material, stump_carrier, stump_key }) {
     if (stump_carrier.length === 0) return;
-    const number = new Map(Array.from(stump_carrier, (carrier, k) => [carrier, k]));
+    const carriers = new Set();
+    const number = new Map();
+    stump_carrier.forEach((_, k) => {
+      const key = stump_key.subarray(4 * k, 4 * k + 4);
+      carriers.add(key[0]);
+      number.set(key.join(), k);
+    });
+    const shapes = this.shapes.image.data,
+      surface = this.surfaces.image.data,
+      colour = new Uint32Array(stump_surface.slice().buffer);
     for (let row = 0; row < this.plants; ++row) {
-      const k = number.get(this.surfaces.image.data[4 * row + 2]);
-      if (k !== undefined) this.shapes.image.data.set(stump_shape.subarray(16 * k, 16 * k + 16), 16 * row);
+      if (!carriers.has(surface[4 * row + 2])) continue;
+      const point = shapes.subarray(16 * row, 16 * row + 3);
+      const k = number.get(`${surface[4 * row + 2]},${point.join()}`);
+      if (k === undefined) continue;
+      shapes.set(stump_shape.subarray(16 * k, 16 * k + 16), 16 * row);
+      surface.set([colour[k], stump_material[k], stump_carrier[k]], 4 * row);
     }
   }
 

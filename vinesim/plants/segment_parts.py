@@ -1,0 +1,147 @@
+"""Parts of a segment of wood: mass, inertia and spring of the part between two places along it.
+
+A segment is a uniform rod, with the point masses of its leaves, and of a weight at one end if its centre of mass says
+so. Mass, first and second moments of the parts of a segment add up to those of the segment.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from vinesim.core import frames
+from vinesim.scene.ids import Organ
+from vinesim.scene.model import Model
+from vinesim.scene.spare_bodies import PLACE_STEP
+
+SHORTEST = 5e-4
+"""Shortest part that a cut leaves on either side [m]. A shorter part would be too light for its joint."""
+_LEAST_END_MASS = 1e-5
+"""Share of the wood's mass below which a weight at the end of a segment is rounding."""
+
+
+def place_between(start: float, end: float, at: float, body: int) -> float:
+    """Returns the place [m] of a cut at ``at`` [m] in wood from ``start`` to ``end`` [m]: a multiple of
+    :data:`PLACE_STEP`, not closer than :data:`SHORTEST` to an end.
+
+    ``body`` is named in errors. Raises :class:`ValueError` if ``at`` is not in this wood, or the wood is too short.
+    """
+    if not start <= at <= end:
+        raise ValueError(f"a cut at {at} m along body {body}, whose wood is from {start:.4g} to {end:.4g} m")
+    if end - start < 2.0 * SHORTEST + PLACE_STEP:
+        raise ValueError(f"a cut in body {body}, which has {1e3 * (end - start):.2g} mm of wood; cut a longer piece")
+    least = int(np.ceil((start + SHORTEST) / PLACE_STEP - 1e-6))
+    most = int(np.floor((end - SHORTEST) / PLACE_STEP + 1e-6))
+    return min(max(round(at / PLACE_STEP), least), most) * PLACE_STEP
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """A part of a segment of wood, in the segment's frame."""
+
+    mass: float
+    """[kg]"""
+    com: np.ndarray
+    """[3] m, centre of mass."""
+    inertia: np.ndarray
+    """[3] kg m^2, moments about the centre of mass."""
+    drag: float
+    """[m^2] Drag area."""
+
+
+def part_of(model: Model, segment: int, start: float, end: float) -> Part:
+    """Returns the part of a segment's wood from ``start`` to ``end`` [m], with the leaves that grow on it.
+
+    All parts keep the lateral offset of the segment's centre of mass, so that their products of inertia are zero, as
+    those of the segment are. The true offset differs by that of leaves, which is about a centimetre.
+    """
+    length = float(model.body_length[segment])
+    mass = float(model.body_mass[segment])
+    com = model.body_com[segment].astype(float)
+    xx, yy, zz = model.body_inertia[segment].astype(float)
+    second = 0.5 * np.array([yy + zz - xx, zz + xx - yy, xx + yy - zz])  # of mass, about the centre, along each axis
+    leaves = np.flatnonzero(model.leaf_body == segment)
+    leaf_mass = model.leaf_mass[leaves].astype(float)
+    leaf_at = model.leaf_pose[leaves, :3].astype(float)
+    wood = mass - leaf_mass.sum()
+    middle = (mass * com[0] - leaf_mass @ leaf_at[:, 0]) / wood
+    end_mass = (2.0 * middle / length - 1.0) * wood  # at the tip; at the base if negative
+    if abs(end_mass) < _LEAST_END_MASS * wood:
+        end_mass = 0.0
+    rod = wood - abs(end_mass)
+    if not (wood > 0.0 and rod > 0.0):
+        raise ValueError(f"body {segment}: its mass {mass:.3g} kg with leaves of {leaf_mass.sum():.3g} kg is no rod")
+    tip = length if end_mass > 0.0 else 0.0
+    # what the rod and the points do not explain is spread along the rod
+    points = np.append(leaf_mass, abs(end_mass))
+    places = np.append(leaf_at[:, 0], tip)
+    known = rod * (length * length / 12.0 + (0.5 * length - com[0]) ** 2) + points @ (places - com[0]) ** 2
+    rest = second[0] - known
+    across = leaf_mass[:, None] * (leaf_at[:, 1:] - com[1:]) ** 2
+    around = np.maximum(second[1:] - across.sum(0), 0.0)  # of the rod
+    whole = around + across.sum(0)
+
+    share = (end - start) / length
+    grows = (start <= model.leaf_base[leaves, 0]) & (model.leaf_base[leaves, 0] < end)
+    here = np.append(grows, start <= tip < end or (end >= length and tip == length))
+    if start <= 0.0:
+        here[:-1] |= model.leaf_base[leaves, 0] < 0.0
+    if end >= length:
+        here[:-1] |= model.leaf_base[leaves, 0] >= length
+    own = points[here]
+    x = places[here]
+    total = share * rod + own.sum()
+    center = (share * rod * 0.5 * (start + end) + own @ x) / total
+    along = share * rod * ((end - start) ** 2 / 12.0 + (0.5 * (start + end) - center) ** 2) + own @ (x - center) ** 2
+    along += share * rest
+    if not along > 0.0:
+        raise ValueError(f"body {segment}: inertia {model.body_inertia[segment]} kg m^2 is not that of a rod")
+    beside = (share * around + across[here[:-1]].sum(0)) * np.where(whole > 0.0, second[1:] / whole, 0.0)
+    drag = model.leaf_drag[leaves].astype(float)
+    bare = max(float(model.body_drag[segment]) - drag.sum(), 0.0)
+    return Part(
+        total,
+        np.array([center, com[1], com[2]]),
+        np.array([beside.sum(), along + beside[1], along + beside[0]]),
+        share * bare + float(drag[here[:-1]].sum()),
+    )
+
+
+_CLAMPED = 2.0 * 3.0 / 1.875104**4
+"""Compliance of the spring at a clamp with which a rigid rod has the first frequency of an elastic one, relative to
+that of half the rod. w^2 = 3 k / (m L^2) of the rigid rod equals 1.875104^4 E I / (m L^3) of the Euler-Bernoulli beam.
+"""
+
+
+def joint_compliance(model: Model, segment: int, own: float, above: float) -> float:
+    """Returns the compliance of a segment's joint relative to the model's, if the segment has the share ``own`` of its
+    length, and its parent the share ``above``.
+
+    A joint bends for the half of its segment and the half of the parent that meet there
+    (:mod:`vinesim.scene.builder`). Each has a compliance of half its length over its flexural rigidity at the joint.
+    Both are taken as the same wood; where they are not, the thicker parent's share is small. The spring of a stump at a
+    clamp bends for the whole stump, which has no other joint.
+    """
+    parent = int(model.body_parent[segment])
+    if parent < 0 or model.body_organ[parent] == int(Organ.BUNCH):
+        return _CLAMPED * own if own < 1.0 else 1.0
+    length = model.body_length[[segment, parent]].astype(float)
+    radius = np.array([model.body_radius[segment, 0], model.body_radius[parent, 1]], float)
+    if not (radius > 0.0).all():
+        return own
+    half = length / radius**4
+    share = float(half[0] / half.sum())
+    return share * own + (1.0 - share) * above
+
+
+def relaxed_joint(model: Model, segment: int, compliance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the rest rotation [4] and the settled rotation [4] of a segment's joint whose compliance has become
+    ``compliance`` times the model's.
+
+    In the drawn shape the joint carries the same moment and has the same pose as before: its elastic angle is smaller
+    by the factor, and the rest pose turns by the difference. So no energy comes from a change of stiffness.
+    """
+    settled = frames.log(model.joint_settled[segment].astype(float))
+    rest = frames.multiply(model.body_rest[segment].astype(float), frames.exp((1.0 - compliance) * settled))
+    return frames.normalize(rest), frames.exp(compliance * settled)
