@@ -10,11 +10,13 @@ import pytest
 from tests.physics.test_wind import leafy
 from tests.support.contact_scenes import bar
 from tests.support.long_rows import long
+from vinesim.core import frames
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.spec import load_scene
 from vinesim.scene.state import State
+from vinesim.scene.values import WindState
 from vinesim.scene.wind import Wind
 from vinesim.wind import sway
 from vinesim.wind.shelter import ATTENUATION, TreeDrag, height_profile
@@ -210,3 +212,25 @@ def test_of_many_trees_those_are_drawn_whose_picture_is_most_out_of_date(monkeyp
         times[posed] += 1
     assert times.min() >= 2  # none is forgotten
     assert times[1] > 2 * times[-1]  # the near ones move more in the picture
+
+
+def test_a_stump_sways_with_the_cane_that_it_is_on():
+    """In the wind's drawn pose, a stump stays at the tip of its parent, and what was cut off does not sway."""
+    model = generate(load_scene("vsp"))
+    wind = Wind([3.0, 2.0, 0.0])
+    physics = Physics(model)
+    rest = physics.snapshot()
+    sways = np.linalg.norm(windblown(model, rest, wind, 3.0).body_q[:, :3] - rest.body_q[:, :3], axis=1)
+    number = np.arange(len(model.body_mass)) - model.tree_first[model.body_tree]
+    segment = 1 + int(np.argmax(sways * ((number > 4) & (number < 12))))
+    physics.cut(segment, 0.03)
+    physics.step()
+    snapshot = physics.snapshot()
+    stump, parent = int(snapshot.stumps[0, 0]), segment - 1
+    trees = len(model.tree_first)
+    state = WindState(wind, 3.0, 1.0, np.zeros((trees, 3), np.float32), np.ones(trees, np.float32))
+    drawn = Sway(model).apply(dataclasses.replace(snapshot, wind=state)).body_q.astype(float)
+    tip = drawn[parent, :3] + frames.rotate(drawn[parent, 3:], model.body_offset[segment].astype(float))
+    assert np.linalg.norm(drawn[parent, :3] - snapshot.body_q[parent, :3]) > 1e-3, "the parent sways"
+    assert np.linalg.norm(drawn[stump, :3] - tip) < 1e-5
+    np.testing.assert_allclose(drawn[segment, :3], snapshot.body_q[segment, :3], atol=1e-6)

@@ -85,6 +85,7 @@ class Sway:
         is_limited = eye is not None and len(drawn) > MAX_TREES
         changed[self._most_urgent(drawn, state.time, np.asarray(eye, np.float32)) if is_limited else drawn] = True
         trees = np.flatnonzero(changed)
+        self._table.leave_stumps(self.model, snapshot.stumps)
         self._table.pose(trees, state, np.ascontiguousarray(snapshot.body_q, np.float32), self._body_q)
         self._is_drawn[trees] = drawn[trees]
         self._drawn_at[trees] = state.time
@@ -131,6 +132,10 @@ class _Table:
     trees: np.ndarray
     waves: np.ndarray
     arrays: dict[str, wp.array]
+    stumps: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+    """``Snapshot.stumps`` to which the arrays belong."""
+    whole: list[tuple[str, int, np.ndarray]] = dataclasses.field(default_factory=list)
+    """Rows of the arrays before cuts: name, body, value."""
 
     @classmethod
     def load(cls, model: Model, wind: Wind) -> _Table:
@@ -173,6 +178,29 @@ class _Table:
         for name, dtype in (("tree_air", wp.vec3), ("tree_drawn", float), ("trees", wp.int32), ("waves", float)):
             table.arrays[name] = wp.array(getattr(table, name), dtype=dtype, device="cpu", copy=False)
         return table
+
+    def leave_stumps(self, model: Model, stumps: np.ndarray) -> None:
+        """Let each stump sway as the segment did that was cut, and the part beyond not at all. ``stumps`` [k, 3]:
+        ``Snapshot.stumps``."""
+        if np.array_equal(stumps, self.stumps):
+            return
+        self.stumps = stumps.copy()
+        rows = {name: self.arrays[name].numpy() for name in ("body_parent", "body_offset", "body_steady", "body_gain")}
+        for name, body, value in reversed(self.whole):
+            rows[name][body] = value
+        self.whole = []
+        for stump, segment, _ in stumps.tolist():
+            for name, row in rows.items():
+                self.whole += [(name, body, row[body].copy()) for body in (int(stump), int(segment))]
+            for name, value in (("body_parent", model.body_parent), ("body_offset", model.body_offset)):
+                rows[name][int(stump)] = value[int(segment)]
+        for segment in np.unique(stumps[:, 1]).astype(int).tolist():
+            first = stumps[stumps[:, 1] == segment]
+            lowest = int(first[np.argmin(first[:, 2]), 0])
+            for name in ("body_steady", "body_gain"):
+                rows[name][lowest] = rows[name][segment]
+                rows[name][segment] = 0.0
+            rows["body_parent"][segment] = -1
 
     def pose(self, trees: np.ndarray, state: WindState, body_q: np.ndarray, body_q_out: np.ndarray) -> None:
         """Compute poses of ``trees`` [k] at the time of ``state`` from their simulated poses ``body_q`` [body, 7]."""
