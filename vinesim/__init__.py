@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from vinesim.api.picking import PickAttempt as PickAttempt
     from vinesim.api.picking import attempt_pick as attempt_pick
     from vinesim.api.picking import reachable_grasps as reachable_grasps
+    from vinesim.api.plant_work import Hold as Hold
     from vinesim.api.pusher import Pusher as Pusher
     from vinesim.api.recording import RecordedMessage as RecordedMessage
     from vinesim.api.recording import Recording as Recording
@@ -68,6 +69,7 @@ _MODULES = {
     "Client": "api.client",
     "Energy": "api.energy",
     "Grasp": "api.picking",
+    "Hold": "api.plant_work",
     "ImportedPlant": "scene.plant_import.imported_plant",
     "Lidar": "api.sensors",
     "Model": "scene.model",
@@ -114,6 +116,7 @@ __all__ = [
     "Client",
     "Energy",
     "Grasp",
+    "Hold",
     "ImportedPlant",
     "Lidar",
     "Model",

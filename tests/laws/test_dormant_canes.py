@@ -15,6 +15,8 @@ from vinesim.scene.season import load_season
 pytestmark = pytest.mark.slow
 
 G = 9.81
+BACK = np.array([0.0, 0.03, 0.0])
+"""[m] Way back from the cane to where the ball starts."""
 
 
 def beam_frequency(length: float, base: float, tip: float, modulus: float, density: float, rise: float) -> float:
@@ -122,8 +124,8 @@ def test_a_push_at_a_bud_is_the_force_on_that_bud(spurs: Model) -> None:
     half_way = 0.5 * (nodes.positions(generate_rest(spurs))[mine[4]] + nodes.positions(generate_rest(spurs))[mine[5]])
     for place, touched in ((on_axis, {int(nodes.bud[node])}), (half_way, set())):
         simulation = Simulation(spurs)
-        ball = simulation.add_pusher(shape="sphere", size=(0.004,), position=place + [0.0, -0.03, 0.0], force=20.0)
-        ball.follow([place + [0.0, -0.03, 0.0], place + [0.0, -0.004, 0.0]], speed=0.1)
+        ball = simulation.add_pusher(shape="sphere", size=(0.004,), position=place - BACK, force=20.0)
+        ball.follow([place - BACK, place - 0.13 * BACK], speed=0.1)
         most = np.zeros(len(simulation.bud_forces))
         pushed = 0.0
         for _ in range(60):

@@ -1,6 +1,7 @@
 """The year of a vine: published dates, growth without jumps, and a clear line for dates and climates without curves."""
 
 import datetime
+import itertools
 
 import msgspec
 import numpy as np
@@ -34,8 +35,8 @@ def test_flowering_and_veraison_follow_the_sum_of_temperatures() -> None:
 
 
 def test_the_dates_of_latium() -> None:
-    """Budburst in the first half of April, flowering in the last third of May, veraison in July, harvest of table grapes
-    in the middle of September."""
+    """Budburst in the first half of April, flowering at the end of May, veraison in July, harvest of table grapes in the
+    middle of September."""
     dates = [CALENDAR.budburst, CALENDAR.flowering, CALENDAR.veraison, CALENDAR.maturity]
     for day, (first, last) in zip(dates, ((91, 106), (141, 152), (182, 213), (250, 265)), strict=True):
         assert first <= day <= last
@@ -72,7 +73,7 @@ def test_the_forms_of_a_year_follow_each_other() -> None:
     start = datetime.date(2026, 1, 1)
     states = [season.state_on(start + datetime.timedelta(k), None, (1.22, 22.5)) for k in range(365)]
     forms = [state.form for state in states]
-    order = [forms[0]] + [b for a, b in zip(forms, forms[1:], strict=False) if a != b]
+    order = [form for form, _ in itertools.groupby(forms)]
     assert order == ["dormant", "bursting", "growing", "dormant"]
     growing = [state for state in states if state.form == "growing"]
     for name in ("unfolded", "woody", "yellow"):

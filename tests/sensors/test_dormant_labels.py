@@ -35,7 +35,7 @@ def seen(request: pytest.FixtureRequest) -> tuple[Model, ground_truth.PixelBuffe
     primitives.update(snapshot)
     canes = model.canes
     near = model.nodes.positions(snapshot.body_q)[canes.node[np.flatnonzero(canes.year == 1)[4]]]
-    pose = look_at(near + [0.05, -0.5, 0.12], near + [0.02, 0.0, 0.06])
+    pose = look_at(near + np.array([0.05, -0.5, 0.12]), near + np.array([0.02, 0.0, 0.06]))
     view = ground_truth.render_buffers(primitives, INFO, pose)
     across, down = np.broadcast_arrays(*pixel_rays(INFO))
     rays = np.stack([across, down, np.ones_like(across)], -1)

@@ -19,6 +19,7 @@ import msgspec
 import numpy as np
 
 from vinesim.api.energy import Energy, Momentum, energy, momentum
+from vinesim.api.plant_work import PULL_SPEED, TIE_REACH, Hold, place_at_wire, tied_places
 from vinesim.api.pusher import Pusher, checked_shape
 from vinesim.client.faults import FaultLog, occurred
 from vinesim.contact.bud_forces import bud_forces
@@ -120,6 +121,7 @@ class Simulation:
         self._loads: dict[int, np.ndarray] = {}
         self._pushed: set[tuple[str, str]] = set()
         self._detachments: list[Detachment] = []
+        self._holds: list[Hold] = []
         self._primitives: Primitives | None = None
         self._sway = Sway(model)
         self._fault_log = FaultLog(_warn_caller_of_step)
@@ -144,6 +146,8 @@ class Simulation:
                 robot.control(self.physics.time)
             for pusher in self.pushers.values():
                 pusher.control()
+            for held in self._holds:
+                held.control()
             self.physics.step()
             self._detachments += self.physics.detachments
         for body, before in self._loads.items():
@@ -198,7 +202,7 @@ class Simulation:
         """[bud] N, force on each bud of dormant canes in the last step: the sum of the magnitudes of the forces of
         contacts at its place along the cane. The id of a bud is its index; :attr:`~vinesim.scene.model.Model.nodes`
         tells where buds are."""
-        return bud_forces(self.model, self.state.body_q, self.contacts)
+        return bud_forces(self.model, self.state, self.contacts)
 
     @property
     def detachments(self) -> tuple[Detachment, ...]:
@@ -339,6 +343,56 @@ class Simulation:
     def pick(self, bunch: int) -> None:
         """Detach a bunch from its vine, so that it falls. ``bunch``: index in the model."""
         self.physics.pick(checked_index("bunch", bunch, len(self.model.bunch_body), UsageError))
+
+    def untie(self, tie: int) -> None:
+        """Open a tie of the model, so that it holds its cane no longer. ``tie``: index into ``model.tie_body``. A tie
+        that was opened before stays open. :meth:`Hold.release` opens ties of :meth:`tie`."""
+        tie = checked_index("tie", tie, len(self.model.tie_body), UsageError)
+        self.physics.plants.open_tie(tie)
+        self.wake(int(self.model.body_tree[self.model.tie_body[tie]]))
+
+    def hold(self, body: int, along: float = 0.0) -> Hold:
+        """Hold a cane or a bunch as a hand does, where it is now; see :class:`Hold`.
+
+        Args:
+            body: index in the model.
+            along: distance of the held place from the body's origin [m].
+        """
+        body = self._body(body)
+        length = float(self.model.body_length[body])
+        if not (is_number(along) and 0.0 <= along <= length):
+            raise UsageError(f"along is {along}: body {body} is {length:.4g} m long; give 0 to {length:.4g}")
+        held = Hold(self.physics.plants, body, float(along))
+        self._holds = [one for one in self._holds if one.is_held] + [held]
+        self.wake(int(self.model.body_tree[body]))
+        return held
+
+    def tie(self, body: int, along: float | None = None, to: Sequence[float] | np.ndarray | None = None) -> Hold:
+        """Tie a cane. The tie pulls its place to the wire within a second or two, and holds it there.
+
+        Args:
+            body: index in the model.
+            along: distance of the tied place from the body's origin [m]; with neither ``along`` nor ``to`` the place
+                nearest to a wire.
+            to: [3] m, the point to which the place is tied; unless given, beside the nearest wire, which does not
+                yield to this tie.
+
+        The tree stays awake. Raises :class:`UsageError` if no wire is near. As many bodies can be tied or held at once as the physics
+        parameter ``max_held_bodies`` says.
+        """
+        if to is not None:
+            to = checked_vector("to", to, "m", UsageError)
+            along = 0.0 if along is None else along
+        else:
+            pose = self.body_pose(body).astype(float)
+            places = tied_places(float(self.model.body_length[body])) if along is None else as_numbers([along])
+            points = pose[:3] + frames.rotate(pose[3:], places[:, None] * np.array([1.0, 0.0, 0.0]))
+            radius = float(self.model.body_radius[body].mean())
+            nearest, to = place_at_wire(self.model, points, radius, TIE_REACH)
+            along = float(places[nearest])
+        held = self.hold(body, along)
+        held.follow(to, PULL_SPEED)
+        return held
 
     def add_robot(
         self,

@@ -12,18 +12,19 @@ import numpy as np
 
 from vinesim.core import frames
 from vinesim.scene.model import Model
+from vinesim.scene.state import State
 from vinesim.scene.values import Contact
 
 BUD_MARGIN = 0.003
 """[m] Distance along the cane from the end of a bud up to which a contact counts as one with it. GUESSED."""
 
 
-def bud_forces(model: Model, body_q: np.ndarray, contacts: Iterable[Contact]) -> np.ndarray:
+def bud_forces(model: Model, state: State, contacts: Iterable[Contact]) -> np.ndarray:
     """Returns the force on each bud [bud] N: the sum of the magnitudes of the contact forces at its place.
 
     Args:
         model: the vineyard; its :attr:`~vinesim.scene.model.Model.nodes` have the buds.
-        body_q: [body, 7] m, 1, poses of plant bodies.
+        state: poses of plant bodies, and cuts.
         contacts: contacts of rigid bodies with plants.
     """
     nodes = model.nodes
@@ -37,7 +38,8 @@ def bud_forces(model: Model, body_q: np.ndarray, contacts: Iterable[Contact]) ->
     middle = pose[:, 0] + half
     reach = half + BUD_MARGIN
     by_body: dict[int, list[int]] = {}
-    for row, body in enumerate(nodes.body[has].tolist()):
+    carrier = nodes.carriers(state.stump_of, state.stump_end)[has]
+    for row, body in enumerate(carrier.tolist()):
         by_body.setdefault(body, []).append(row)
     for contact in contacts:
         # a bud at the end of a segment reaches into the next one
@@ -45,7 +47,7 @@ def bud_forces(model: Model, body_q: np.ndarray, contacts: Iterable[Contact]) ->
             rows = by_body.get(body)
             if not rows:
                 continue
-            at = np.asarray(body_q[body], float)
+            at = state.body_q[body].astype(float)
             local = frames.rotate(frames.conjugate(at[3:]), contact.position - at[:3])
             near = [row for row in rows if abs(local[0] - middle[row]) <= reach[row]]
             forces[nodes.bud[has[near]]] += float(np.linalg.norm(contact.force))

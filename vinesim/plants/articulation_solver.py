@@ -726,6 +726,11 @@ class ArticulationSolver:
         self.ties.remove(body, tie)
         self._find_falling(self.bodies_of(self.model.body_tree[[body]]))
 
+    def open_tie(self, tie: int) -> None:
+        """Open a tie of the model, which then holds nothing."""
+        body = self.ties.release(tie)
+        self._find_falling(self.bodies_of(self.model.body_tree[[body]]))
+
     def joint_wrench(self, bodies: np.ndarray) -> np.ndarray:
         """Returns the wrench [n, 6] that the parent of each of the ``bodies`` [n] exerted on the body through its joint
         in the last step: force [N], and moment [N m] about the body's origin, world axes.

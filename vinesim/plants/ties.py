@@ -79,8 +79,9 @@ class TieTable:
 
     @property
     def tied_bodies(self) -> np.ndarray:
-        """Bodies with ties [k]."""
-        return np.append(np.unique(self.tie_body), np.array(self.held_bodies, np.int32))
+        """Bodies with ties that hold them [k]."""
+        bound = np.unique(self.tie_body[self.stiffness[: self._model_ties] > 0.0])
+        return np.append(bound, np.array(self.held_bodies, np.int32))
 
     def number_on_body(self, ties: np.ndarray) -> np.ndarray:
         """Returns the number [k] of each of the model's ``ties`` [k] among those of its body, from 0."""
@@ -141,6 +142,14 @@ class TieTable:
         if not self.stiffness[start : start + self._max_hands].any():
             del self._slot_of[body]
             self.span[body] = self._model_span[body]
+
+    def release(self, tie: int) -> int:
+        """Open a tie of the model, so that it holds nothing. Returns the body that it held."""
+        body = int(self.tie_body[tie])
+        self.stiffness[tie] = self.damping[tie] = self.softening[tie] = 0.0
+        if body in self._slot_of:
+            self._copy_model_ties(body)
+        return body
 
     def _hands_start(self, body: int) -> int:
         return self._model_ties + self._span_size * self._slot_of[body] + self._max_model_ties

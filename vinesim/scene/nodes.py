@@ -44,19 +44,33 @@ class Nodes(StructOfArrays):
     bud_radius: np.ndarray = array("node", unit="m")
     """Radius of the bud at its base."""
 
-    def positions(self, body_q: np.ndarray) -> np.ndarray:
-        """Returns the positions of the nodes on the axes of their canes [node, 3] m, from the poses of all bodies
-        [body, 7]."""
-        pose = np.asarray(body_q, float)[self.body]
+    def carriers(self, stump_of: np.ndarray, stump_end: np.ndarray) -> np.ndarray:
+        """Returns the bodies [node] that carry the nodes after cuts within their segments: the stump before a cut, the
+        body itself beyond it. ``stump_of``, ``stump_end``: those of :class:`~vinesim.scene.state.State`."""
+        carrier = self.body.copy()
+        stumps = np.flatnonzero(stump_of >= 0)
+        for stump in stumps[np.argsort(-stump_end[stumps], kind="stable")].tolist():
+            carrier[(self.body == stump_of[stump]) & (self.along < stump_end[stump])] = stump
+        return carrier
+
+    def positions(self, body_q: np.ndarray, carrier: np.ndarray | None = None) -> np.ndarray:
+        """Returns the positions of the nodes on the axes of their canes [node, 3] m.
+
+        Args:
+            body_q: [body, 7] m, 1, poses of all bodies.
+            carrier: bodies of :meth:`carriers`, where canes may have been cut within a segment; :attr:`body` unless
+                given.
+        """
+        pose = np.asarray(body_q, float)[self.body if carrier is None else carrier]
         along = self.along.astype(float)[:, None] * np.array([1.0, 0.0, 0.0])
         return pose[:, :3] + frames.rotate(pose[:, 3:], along)
 
-    def bud_poses(self, body_q: np.ndarray) -> np.ndarray:
-        """Returns the poses of the buds [bud, 7] m, 1 in the world, by the bud's id, from the poses of all bodies
-        [body, 7]."""
+    def bud_poses(self, body_q: np.ndarray, carrier: np.ndarray | None = None) -> np.ndarray:
+        """Returns the poses of the buds [bud, 7] m, 1 in the world, by the bud's id; see :meth:`positions`."""
         has = np.flatnonzero(self.bud >= 0)
         has = has[np.argsort(self.bud[has], kind="stable")]
-        return frames.compose(np.asarray(body_q, float)[self.body[has]], self.bud_pose[has].astype(float))
+        body = (self.body if carrier is None else carrier)[has]
+        return frames.compose(np.asarray(body_q, float)[body], self.bud_pose[has].astype(float))
 
 
 @dataclasses.dataclass

@@ -300,7 +300,10 @@ class RosProcess:
             truth["bunch_q"][:] = physics.state.body_q[self._model.bunch_body]
             canes = self._model.canes.body
             truth["dormant_q"][: len(canes)] = physics.state.body_q[canes]
-            truth["dormant_q"][len(canes) :] = self._model.nodes.bud_poses(physics.state.body_q)
+            nodes = self._model.nodes
+            state = physics.state
+            carrier = nodes.carriers(state.stump_of, state.stump_end)
+            truth["dormant_q"][len(canes) :] = nodes.bud_poses(state.body_q, carrier)
             truth["version"][0] = self._truth_list.version
             self._truth_list.memory["visual_q"][: len(self._truth_rows)] = physics.visual_q()[self._truth_rows]
 

@@ -253,7 +253,8 @@ class RosWorker(Worker):
             self.node.publish_sound(block.time + step.to_world, to_pcm(block.samples))
 
     def _publish_truth(self) -> None:
-        """Publish the true poses of rigid bodies, of dormant canes and buds, and of the bunches that are attached to their plants."""
+        """Publish the true poses of rigid bodies, of dormant canes and buds, and of the bunches that are attached to
+        their plants."""
         with self.channel.truth.reading() as truth:
             version = int(truth["version"][0])
             memory = self._rigid.memory

@@ -65,7 +65,7 @@ seen."""
 _ONLY_IN_COLUMNS = ("a", "b", "c", "d", "material", "tint", "organ", "label", "carrier")
 """Fields of :class:`ClusterLayout` with a value for each primitive; after loading they are only in the device's
 columns."""
-_CUT_COLUMNS = ("local_a", "local_b", "local_c", "tint", "material", "sky", "carrier")
+_CUT_COLUMNS = ("local_a", "local_b", "local_c", "tint", "material", "sky", "organ", "label", "carrier")
 """Columns of primitives that a cut of a cane changes."""
 _CLUSTER_COLUMNS = {**dict.fromkeys(("first", "size", "cluster_kind", "shown"), wp.int32), "ball": wp.vec4}
 """Columns of the table of clusters: name -> type."""
@@ -393,12 +393,14 @@ class Primitives:
                     for name, at in (("local_a", start), ("local_b", end)):
                         drawn[name][own] = first + (at / edges[-1]) * (last - first)
                 drawn["carrier"][here[(start <= base[here]) & (base[here] < end)]] = body
-        changed = np.flatnonzero(np.any([(drawn[n] != whole[n]).reshape(len(rows), -1).any(1) for n in drawn], axis=0))
+        differs = [(drawn[name] != whole[name]).any(tuple(range(1, whole[name].ndim))) for name in drawn]
+        changed = np.flatnonzero(np.any(differs, axis=0))
         for k in changed.tolist():
             row = int(rows[k])
             self._whole[row] = {name: values[k : k + 1].copy() for name, values in whole.items()}
             for name in drawn:
                 self._columns[name][row : row + 1].assign(drawn[name][k : k + 1])
+        self.label, self.organ = (self._columns[name][: self.count].numpy() for name in ("label", "organ"))
         self._know([*self._whole])
         return trees
 
@@ -410,10 +412,16 @@ class Primitives:
         carrier = columns["carrier"]
         place = start[:, 0].astype(float)
         organ, material = (self._columns[name].numpy()[rows] for name in ("organ", "material"))
-        is_wood = (organ == int(Organ.CANE)) & (start[:, :3] == 0.0).all(1) & (end[:, 1:3] == 0.0).all(1)
+        is_wood = np.isin(organ, (Organ.CANE, Organ.SPUR)) & (start[:, :3] == 0.0).all(1) & (end[:, 1:3] == 0.0).all(1)
         place[is_wood] = np.nan
         is_node = (organ == int(Organ.CANE)) & (material == int(materials.CANE)) & ~is_wood
         place[is_node] += 7.0 / 11.0 * (end[is_node, 0] - start[is_node, 0])
+        nodes = model.nodes
+        index = self._columns["label"].numpy()[rows] % LABEL_STRIDE
+        of_bud = np.flatnonzero(nodes.bud >= 0)  # buds are numbered in the order of their nodes
+        for kind, along in ((Organ.NODE, nodes.along), (Organ.BUD, nodes.along[of_bud])):
+            here = organ == int(kind)
+            place[here] = along[index[here]]
         for body in np.unique(carrier).tolist():
             leaves = np.flatnonzero(model.leaf_body == body)
             here = np.flatnonzero((carrier == body) & (material == int(materials.FOLIAGE)))
