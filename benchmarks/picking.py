@@ -7,8 +7,8 @@ attempt succeeds when the bunch has been cut, is in the hand and has been drawn 
 ``--by truth``: planning and control use poses read from the simulation. Arm, hand, blade and canopy are tested,
 perception is not. ``--by cameras``: the robot looks around from places within reach with its head camera (the
 pictures are taken there without driving), finds bunches, chooses where to stand, looks again from there, picks, and
-checks by the camera whether the bunch is in its hand. It knows its base and joints, its forces, and the trellis. Whether
-it has picked is counted by the truth.
+checks by the camera whether the bunch is in its hand. It knows its base and joints, its forces, and the trellis.
+Whether it has picked is counted by the truth.
 
 ``--record FILE`` keeps a line of JSON for each seed, so that a long run can be continued.
 """

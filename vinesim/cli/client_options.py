@@ -124,9 +124,9 @@ class ClientOptions:
         typer.Option(hidden=True, help="Robots: reach for this bunch and push it repeatedly."),
     ] = None
     """The option is hidden, like all options with which a demo or a benchmark controls its clients."""
-    job: Annotated[str | None, OF_ROBOT, typer.Option(help="Robots: do a task and stop: pick, exchange or meet.")] = (
-        None
-    )
+    job: Annotated[
+        str | None, OF_ROBOT, typer.Option(help="Robots: do a task and stop: pick, exchange, meet or prune.")
+    ] = None
     bunches: Annotated[
         int,
         OF_ROBOT,

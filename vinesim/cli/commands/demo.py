@@ -15,7 +15,7 @@ def demo(
         str,
         typer.Option(
             help="push: push a bunch again and again. pick: put a bunch into a box. exchange: a full box for an "
-            "empty one. meet: a person picks into a box that a robot holds."
+            "empty one. meet: a person picks into a box that a robot holds. prune: cut the canes of a dormant vine."
         ),
     ] = "push",
     seconds: Annotated[
@@ -39,7 +39,9 @@ def demo(
     seed: Seed = None,
     scene: Annotated[
         str | None,
-        typer.Option(help="A scene file, or the name of a shipped scene; by default demo, or harvest for tasks."),
+        typer.Option(
+            help="A scene file, or a shipped scene by name; by default demo, for tasks harvest, to prune winter_spur."
+        ),
     ] = None,
     robot: Annotated[
         str | None,
@@ -56,7 +58,7 @@ def demo(
 
     Starts a server, two robot clients (one for a task) and a plain rclpy subscriber, each in its own process, on free
     ports. The seconds of a push begin when server, clients, sensors and subscriber are all ready. summary.json holds
-    the measurements; for a task also whether it was done ("picked", "exchanged", "handed_over") and if not, why.
+    the measurements; for a task also whether it was done ("picked", "exchanged", "handed_over", "pruned"), if not, why.
     In the task meet, a carrier brings a box to a person of another client, who picks a bunch and lays it into the box.
 
     \b
@@ -70,6 +72,7 @@ def demo(
       vinesim demo --job pick --see
       vinesim demo --job exchange
       vinesim demo --job meet
+      vinesim demo --job prune
     """
     if job == "push":
         from vinesim.cli.demo.push_demo import run_push

@@ -28,12 +28,15 @@ JOBS = {
     "pick": ("vinebot", "picked"),
     "exchange": ("logistic", "exchanged"),
     "meet": ("logistic", "handed_over"),
+    "prune": ("vinebot", "pruned"),
 }
 """Default robot, and the key in ``summary.json`` that tells whether the task was done, by task."""
 TIME_LIMIT = 120.0
 """Default limit of the simulated time of a task [s]."""
 
 
+PRUNING_TIME = 400.0
+"""Default limit of the simulated time of pruning one vine [s]."""
 SETTLE_TIME = 2.0
 """Time after the time-out of a task itself [s], so that its own reason is reported."""
 
@@ -59,7 +62,7 @@ def run_job(
     check_device(device)
     default_robot, done_key = JOBS[job]
     robot = robot or default_robot
-    scene = scene or "harvest"
+    scene = scene or ("winter_spur" if job == "prune" else "harvest")
     plan = with_seed(load_scene(scene), seed)
     description = load_description(robot)  # raise errors before any process starts
     with writing(out):
@@ -141,6 +144,8 @@ def run_job(
 
 def time_limit(job: str, harvest: HarvestOptions, see: bool) -> float:
     """Returns the default limit of the simulated time of a task [s]: a harvest by sight needs time to look around."""
+    if job == "prune":
+        return PRUNING_TIME
     if job != "pick":
         return TIME_LIMIT
     return max(TIME_LIMIT, harvest.timeout + (SURVEY_TIME if see else 0.0)) + SETTLE_TIME

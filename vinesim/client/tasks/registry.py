@@ -9,17 +9,19 @@ import numpy as np
 
 from vinesim.client.tasks.harvesting import NO_BOX, Candidates, HarvestByTruth, HarvestOptions
 from vinesim.client.tasks.planning import box_approaches, fill_box, plan_meeting, plan_swap
+from vinesim.client.tasks.pruning import PruningRule, plan_pruning
 from vinesim.client.tasks.seen_harvest import HarvestBySight
 from vinesim.client.tasks.start_poses import PlacementError
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.meet_person import MeetPerson
+from vinesim.robot.tasks.prune import PruneCanes
 from vinesim.robot.tasks.sight import Eyes
 from vinesim.robot.tasks.swap_boxes import SwapBoxes, SwapPlan
 from vinesim.robot.tasks.task import Task
 from vinesim.scene.model import Model
 from vinesim.world import Physics
 
-TASKS = ("pick", "exchange", "meet")
+TASKS = ("pick", "exchange", "meet", "prune")
 """Names of the tasks that :func:`plan_task` plans."""
 
 
@@ -59,6 +61,9 @@ def plan_task(
         if plan is None:
             raise PlacementError("no bunch hangs where a robot reaches it and drives to a box; choose another seed")
         return functools.partial(HarvestByTruth, options=options, candidates=candidates), plan.base_pose
+    if job == "prune":
+        stops = plan_pruning(model, near[:2], PruningRule())
+        return functools.partial(PruneCanes, stops=stops), stops[0].base_pose
     if job == "meet":
         return functools.partial(MeetPerson, plan=plan_meeting(model, near)), near
     boxes = plan_swap(model, near)

@@ -28,6 +28,8 @@ OPENING = 0.15
 """[m] Opening of the fingers, which pass beside the cane."""
 REACHED = 0.004
 """[m] Distance from its place at which the mouth closes."""
+NEAR_ENOUGH = 0.012
+"""[m] Distance from its place at which a mouth that is held up closes nevertheless."""
 TURNED = 0.25
 """[rad] Error of the hand's orientation at which the mouth may close."""
 MAX_SHIFT = 0.012
@@ -188,7 +190,11 @@ class PruneCanes(Task):
         yield from self._move(
             "reach", lambda: self._tip(cut) - APPROACH * cut.ahead, cut, speed=0.35, timeout=10.0, near=0.02
         )
-        yield from self._move("advance", lambda: self._tip(cut), cut, speed=0.10, timeout=6.0, near=REACHED)
+        try:
+            yield from self._move("advance", lambda: self._tip(cut), cut, speed=0.10, timeout=4.0, near=REACHED)
+        except TaskFailed:
+            if self.arm.distance_to(self._tip(cut)) > NEAR_ENOUGH:
+                raise
         blades = self.robot.cutter_blades(self.arm.gripper)
         for _ in range(MAX_CLOSURES):
             closed = [blade.closures for blade in blades]
@@ -250,9 +256,7 @@ class PruneCanes(Task):
         here = self._place(cut)
         nodes = self.physics.model.nodes
         state = self.physics.state
-        pose = state.body_q[nodes.carriers(state.stump_of, state.stump_end)].astype(float)
-        along = nodes.along.astype(float)[:, None] * np.array([1.0, 0.0, 0.0])
-        places = pose[:, :3] + frames.rotate(pose[:, 3:], along)
+        places = nodes.positions(state.body_q, nodes.carriers(state.stump_of, state.stump_end))
         near = (np.linalg.norm((places - here)[:, :2], axis=1) < 0.3) & (np.abs(places[:, 2] - here[2]) < 0.2)
         near &= self.physics.model.canes.year[nodes.cane] == 1
         off: list[list[float]] = []
