@@ -106,6 +106,6 @@ def test_a_survey_visits_free_places_around_the_start():
     model, near, _ = harvest()
     places = np.array(survey_places(model, near))
     assert len(places) > 5
-    assert np.linalg.norm(places - near, axis=1).max() < 3.0
+    assert np.linalg.norm(places - near, axis=1).max() < 3.9
     assert start_poses.ground_clearance(model, places).min() > planning.BASE_CLEARANCE
     assert np.linalg.norm(places[0] - near) < 1.0

@@ -25,6 +25,8 @@ from vinesim.world import Physics
 
 SURVEY_REACH = 3.0
 """[m] Distance from the start within which the robot looks for bunches and picks."""
+SURVEY_MARGIN = 0.9
+"""[m] Further distance up to which it looks from: bunches at the edge are seen from beyond, too."""
 SURVEY_SPACING = 1.1
 """[m] Distance between the places from which it looks."""
 GAZES = (-1.2, -0.4, 0.4, 1.2)
@@ -129,9 +131,10 @@ def _hold(seen: SeenBunch) -> np.ndarray:
 def survey_places(model: Model, near: np.ndarray) -> list[np.ndarray]:
     """Returns places [2] m around the start ``near`` [2] m from which the robot looks for bunches, in the order of a
     short tour."""
-    steps = np.arange(-SURVEY_REACH, SURVEY_REACH + 0.01, SURVEY_SPACING)
+    reach = SURVEY_REACH + SURVEY_MARGIN
+    steps = SURVEY_SPACING * np.arange(-np.floor(reach / SURVEY_SPACING), np.floor(reach / SURVEY_SPACING) + 1.0)
     places = near + np.stack(np.meshgrid(steps, steps, indexing="ij"), -1).reshape(-1, 2)
-    places = places[np.linalg.norm(places - near, axis=1) < SURVEY_REACH]
+    places = places[np.linalg.norm(places - near, axis=1) < reach]
     left = list(places[ground_clearance(model, places) > planning.BASE_CLEARANCE])
     tour: list[np.ndarray] = []
     here = near
