@@ -1,9 +1,9 @@
 """``python -m benchmarks pruning``: prunes a dormant vine of scene ``winter_spur`` by rule, in simulated time.
 
 Each seed is a vineyard; the robot prunes the vine nearest to its start place, with poses of canes from the simulation.
-Measured are the cuts that were made, their distance from the wanted places, other canes that were cut, the largest force
-on a bud of the kept spurs, and the seconds. ``--record FILE`` keeps a line of JSON for each seed, so that a long run can
-be continued.
+Measured are the cuts that were made, their distance from the wanted places, other canes that were cut, the largest
+force on a bud of the kept spurs, and the seconds. ``--record FILE`` keeps a line of JSON for each seed, so that a long
+run can be continued.
 """
 
 from __future__ import annotations
