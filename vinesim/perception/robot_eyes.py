@@ -25,13 +25,19 @@ class RobotEyes:
     """Takes a picture with a robot's first camera and finds the bunches in it. A call takes about 0.3 s on a CPU."""
 
     def __init__(
-        self, physics: Physics, robot: Robot, *, sun: np.ndarray | None = None, seed: int = 0, device: str = "cpu"
+        self,
+        physics: Physics,
+        robot: Robot,
+        *,
+        sun: tuple[float, float, float] = DEFAULT_SUN,
+        seed: int = 0,
+        device: str = "cpu",
     ) -> None:
         """``sun`` [3]: direction to the sun. ``seed``: of the noise of colours and depth.
 
         Raises :class:`UsageError` if the robot has no camera.
         """
-        mounts = robot.description.sensors_of(CameraMount.kind)
+        mounts = [one for one in robot.description.sensors if isinstance(one, CameraMount)]
         if not mounts:
             raise UsageError(f"{robot.name} has no camera to see with; give another robot")
         mount = mounts[0]
@@ -45,7 +51,7 @@ class RobotEyes:
             spec,
             resized_intrinsics(spec, mount.size),
             mount.name,
-            DEFAULT_SUN if sun is None else sun,
+            sun,
             "fast",
             seed=seed,
             shadow_period=0.0,
