@@ -33,6 +33,21 @@ def _asleep() -> Iterator[Measurement]:
     return _call("vineyard:sleeping_measurements")(load_description("vinebot").to_spec("robot"))
 
 
+def _picking(by: str, seeds: int, first: int, record: pathlib.Path | None) -> Iterator[Measurement]:
+    if seeds < 1:
+        raise UsageError(f"--seeds is {seeds}: give 1 or more")
+    if first < 0:
+        raise UsageError(f"--first is {first}: give 0 or more")
+    return _call("picking:picking")(by, range(first, first + seeds), record, _announce)
+
+
+def _pruning(seeds: int, first: int, spurs: int, record: pathlib.Path | None) -> Iterator[Measurement]:
+    for option, value, least in (("seeds", seeds, 1), ("first", first, 0), ("spurs", spurs, 0)):
+        if value < least:
+            raise UsageError(f"--{option} is {value}: give {least} or more")
+    return _call("pruning:pruning")(range(first, first + seeds), spurs, record, _announce)
+
+
 def _kill(times: int, seed: int) -> Iterator[Measurement]:
     if times < 1:
         raise UsageError(f"--times is {times}: give 1 or more")
@@ -78,7 +93,26 @@ def _later(path: str) -> Callable[..., Iterator[Measurement]]:
 
 BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str, dict[str, Any]]]] = {
     "asleep": (_asleep, "a step of a vineyard of ten thousand bunches, of which twenty trees are awake", {}),
-    "picking": (_later("picking:picking"), "pick every bunch within reach of a start place, in simulated time", {}),
+    "picking": (
+        _picking,
+        "pick every bunch within reach of a start place, in simulated time",
+        {
+            "by": {"default": "truth", "choices": ["truth", "cameras"], "help": "what the robot knows of the plants"},
+            "seeds": {"type": int, "default": 1, "help": "number of vineyards"},
+            "first": {"type": int, "default": 7, "help": "seed of the first vineyard"},
+            "record": {"type": pathlib.Path, "help": "file of results by seed; seeds that it has are not run again"},
+        },
+    ),
+    "pruning": (
+        _pruning,
+        "prune a dormant vine by rule, in simulated time",
+        {
+            "seeds": {"type": int, "default": 1, "help": "number of vineyards"},
+            "first": {"type": int, "default": 1, "help": "seed of the first vineyard"},
+            "spurs": {"type": int, "default": 0, "help": "largest number of spurs of each vine; 0: all"},
+            "record": {"type": pathlib.Path, "help": "file of results by seed; seeds that it has are not run again"},
+        },
+    ),
     "sensors": (
         _later("sensor_accuracy:sensors"),
         "what modelled sensors measure, compared with the truth",

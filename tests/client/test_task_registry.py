@@ -7,15 +7,15 @@ import pytest
 
 from vinesim.client.client import Client
 from vinesim.client.tasks import start_poses
+from vinesim.client.tasks.harvesting import HarvestByTruth
 from vinesim.client.tasks.motions import DriveTo, LookAt
-from vinesim.client.tasks.planning import UnknownTask, plan_task
+from vinesim.client.tasks.registry import UnknownTask, plan_task
 from vinesim.client.tasks.ros_command_handler import MAX_LOGGED, RosCommandHandler
 from vinesim.core import frames
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.loader import load_description as load_robot
 from vinesim.robot.drives.controlled_robot import Robot
-from vinesim.robot.tasks.pick import PickBunch
 from vinesim.robot.tasks.swap_boxes import SwapBoxes
 from vinesim.robot.tasks.task import Task
 from vinesim.ros.commands.types import BaseVelocity, Command, ForwardCommand, JointTrajectory
@@ -59,17 +59,20 @@ def run_to_the_end(client: Client, task: Task) -> Task:
 def test_a_client_runs_the_pick_task():
     """F51, farming: a bunch is cut, carried to a box and rests in it."""
     client, task = client_with("pick", "vinebot", 0)
-    assert isinstance(task, PickBunch)
+    assert isinstance(task, HarvestByTruth)
     while not task.is_done and task.phase != "tuck":
         client.tick()
     assert not task.reason
-    assert client.physics.rigid.free_bunches == (task.plan.bunch,)
+    pick = task.pick
+    assert pick is not None
+    assert client.physics.rigid.free_bunches == (pick.plan.bunch,)
     assert task.report()["phases_s"]["cut"] < 0.1
     run_to_the_end(client, task)
-    assert task.report()["picked"]
-    assert not client.physics.state.bunch_attached[task.plan.bunch]
-    local = frames.compose(frames.inverse(task.box_pose), task.bunch_pose)[:3]
-    assert (np.abs(local[:2]) < 0.5 * client.physics.model.box_size[task.plan.box, :2]).all()
+    assert task.report()["picked"] == task.report()["tried"] == 1
+    assert task.report()["others_off"] == 0
+    assert not client.physics.state.bunch_attached[pick.plan.bunch]
+    local = frames.compose(frames.inverse(pick.box_pose), pick.bunch_pose)[:3]
+    assert (np.abs(local[:2]) < 0.5 * client.physics.model.box_size[pick.plan.box, :2]).all()
 
 
 def test_a_client_runs_the_exchange_task():
@@ -89,7 +92,7 @@ def test_a_client_runs_the_exchange_task():
 
 def test_an_unknown_task_is_refused_with_the_known_ones():
     scene = load_scene("harvest")
-    with pytest.raises(UnknownTask, match="no job 'dance'; give pick, exchange or meet"):
+    with pytest.raises(UnknownTask, match="no job 'dance'; give pick, exchange, meet or prune"):
         plan_task("dance", generate(scene), start_poses.spawn_pose(scene, 0))
 
 

@@ -58,6 +58,8 @@ class PickAttempt:
     """Reason why the pick failed; empty if it succeeded."""
     others: int
     """Number of other bunches that came off their vines."""
+    seconds: float = 0.0
+    """Simulated time from the first motion of the hand to the end [s]."""
 
 
 def reachable_grasps(scene: Scene | str | pathlib.Path, spawn: int = 0, reach: float = 3.0) -> list[Grasp]:
@@ -93,4 +95,4 @@ def attempt_pick(scene: Scene | str | pathlib.Path | Model, grasp: Grasp) -> Pic
         physics.step()
     cut = ~physics.state.bunch_attached
     others = int(cut.sum() - cut[grasp.bunch])
-    return PickAttempt(grasp.bunch, grasp.clearance, not task.is_done, task.reason, others)
+    return PickAttempt(grasp.bunch, grasp.clearance, not task.is_done, task.reason, others, physics.time)

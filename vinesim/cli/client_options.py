@@ -124,9 +124,26 @@ class ClientOptions:
         typer.Option(hidden=True, help="Robots: reach for this bunch and push it repeatedly."),
     ] = None
     """The option is hidden, like all options with which a demo or a benchmark controls its clients."""
-    job: Annotated[str | None, OF_ROBOT, typer.Option(help="Robots: do a task and stop: pick, exchange or meet.")] = (
-        None
-    )
+    job: Annotated[
+        str | None, OF_ROBOT, typer.Option(help="Robots: do a task and stop: pick, exchange, meet or prune.")
+    ] = None
+    bunches: Annotated[
+        int,
+        OF_ROBOT,
+        typer.Option(
+            min=0, help="Robots, --job pick: bunches to put into one crate; 0: until it is full or none is left."
+        ),
+    ] = 1
+    order: Annotated[
+        str,
+        OF_ROBOT,
+        typer.Option(help="Robots, --job pick: freest, the bunch with most room for the hand, or nearest."),
+    ] = "freest"
+    see: Annotated[
+        bool,
+        OF_ROBOT,
+        typer.Option("--see", help="Robots, --job pick: find bunches by the robot's camera, not by the simulation."),
+    ] = False
     walk: Annotated[
         tuple[float, float] | None,
         OF_HUMAN,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,23 +14,28 @@ from vinesim.cli.client_session import ClientSession, save_report
 from vinesim.client.client import Client
 from vinesim.client.processes.robot_processes import RobotProcesses
 from vinesim.client.recording.state_digest import StateDigest
+from vinesim.client.tasks.harvesting import HarvestOptions
 from vinesim.client.tasks.motions import DriveTo, LookAt
-from vinesim.client.tasks.planning import plan_task, validate_task_name
+from vinesim.client.tasks.registry import plan_task, validate_task_name
 from vinesim.client.tasks.start_poses import start_pose, validate_bunch
 from vinesim.core.errors import UsageError, writing
 from vinesim.net.transport.bus import Bus
 from vinesim.robot.description.controllers import only_hardware
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
+from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.push import PushBunch
+from vinesim.robot.tasks.sight import Eyes
 from vinesim.robot.tasks.task import Task
 from vinesim.ros.names import ros_name, ros_namespace
 from vinesim.scene.values import SensorMode, SensorPacing
+from vinesim.world import Physics
 
 
 def run(options: ClientOptions) -> int:
     """Build the client from its options, step until the end, then write the requested files. Returns the exit code."""
     validate_task_name(options.job)
+    harvest = HarvestOptions.named(options.bunches, options.order)
     descriptions = [
         load_description(robot, srdf=options.srdf, xacro_args=options.xacro_args or (), base=options.base)
         for robot in options.robot or ["vinebot"]
@@ -40,7 +46,8 @@ def run(options: ClientOptions) -> int:
     with ClientSession(options) as session:
         begin = start = None
         if options.job is not None:
-            begin, start = plan_task(options.job, session.model, start_pose(session.scene, session.spawn or 0))
+            near = start_pose(session.scene, session.spawn or 0)
+            begin, start = plan_task(options.job, session.model, near, harvest, _eyes(session) if options.see else None)
         for bunch in (options.push, options.watch):
             validate_bunch(session.model, bunch)
         if options.out is not None:
@@ -91,6 +98,13 @@ def run(options: ClientOptions) -> int:
                 with writing(options.out / "trace.npz"):
                     client.trace.rows().save(options.out / "trace.npz")
     return 0
+
+
+def _eyes(session: ClientSession) -> Callable[[Physics, Robot], Eyes]:
+    """Returns a function that makes the eyes of a robot; the picture is rendered between two steps."""
+    from vinesim.perception.robot_eyes import RobotEyes
+
+    return functools.partial(RobotEyes, sun=session.scene.sun.direction(), device=session.options.device)
 
 
 def _check_driven(options: ClientOptions, descriptions: list[RobotDescription]) -> None:

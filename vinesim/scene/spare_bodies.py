@@ -15,6 +15,8 @@ from vinesim.scene.model import Model
 
 SPARES = 2
 """Spare bodies of each tree of a generated vineyard: the number of stumps that cuts may leave in one tree."""
+DORMANT_SPARES = 6
+"""As :data:`SPARES`, for trees of dormant canes, of which each is cut once or twice."""
 PLACE_STEP = 1e-4
 """Unit in which the place of a cut along its segment is counted [m], so that all clients cut at the same place."""
 _MASS = 1e-9

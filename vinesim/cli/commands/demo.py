@@ -15,19 +15,33 @@ def demo(
         str,
         typer.Option(
             help="push: push a bunch again and again. pick: put a bunch into a box. exchange: a full box for an "
-            "empty one. meet: a person picks into a box that a robot holds."
+            "empty one. meet: a person picks into a box that a robot holds. prune: cut the canes of a dormant vine."
         ),
     ] = "push",
     seconds: Annotated[
         float | None,
         typer.Option(
-            min=6.0, help="Time that the robots push [s], by default 20; or time limit of a task, by default 120."
+            min=6.0,
+            help="Time that the robots push [s], by default 20; or time limit of a task, by default 120, and more for "
+            "more than one bunch.",
         ),
     ] = None,
+    bunches: Annotated[
+        int,
+        typer.Option(min=0, help="pick: number of bunches for one crate; 0: until it is full or none is left."),
+    ] = 1,
+    order: Annotated[
+        str, typer.Option(help="pick: freest, the bunch with most room for the hand first, or nearest.")
+    ] = "freest",
+    see: Annotated[
+        bool, typer.Option("--see", help="pick: find bunches by the robot's own camera, not by the simulation.")
+    ] = False,
     seed: Seed = None,
     scene: Annotated[
         str | None,
-        typer.Option(help="A scene file, or the name of a shipped scene; by default demo, or harvest for tasks."),
+        typer.Option(
+            help="A scene file, or a shipped scene by name; by default demo, for tasks harvest, to prune winter_spur."
+        ),
     ] = None,
     robot: Annotated[
         str | None,
@@ -44,7 +58,7 @@ def demo(
 
     Starts a server, two robot clients (one for a task) and a plain rclpy subscriber, each in its own process, on free
     ports. The seconds of a push begin when server, clients, sensors and subscriber are all ready. summary.json holds
-    the measurements; for a task also whether it was done ("picked", "exchanged", "handed_over") and if not, why.
+    the measurements; for a task also whether it was done ("picked", "exchanged", "handed_over", "pruned"), if not, why.
     In the task meet, a carrier brings a box to a person of another client, who picks a bunch and lays it into the box.
 
     \b
@@ -54,8 +68,11 @@ def demo(
       vinesim demo --scene my-block.toml --robot my-robot.urdf --headless
       vinesim demo --real-time-factor 0.5
       vinesim demo --job pick --seed 5
+      vinesim demo --job pick --bunches 0 --order nearest
+      vinesim demo --job pick --see
       vinesim demo --job exchange
       vinesim demo --job meet
+      vinesim demo --job prune
     """
     if job == "push":
         from vinesim.cli.demo.push_demo import run_push
@@ -72,9 +89,12 @@ def demo(
         )
     else:
         from vinesim.cli.demo.task_demo import run_job
+        from vinesim.client.tasks.harvesting import HarvestOptions
 
         code = run_job(
             job,
+            harvest=HarvestOptions.named(bunches, order),
+            see=see,
             seconds=seconds,
             seed=seed,
             scene=scene,

@@ -12,7 +12,10 @@ from vinesim.cli.demo.placement import check_device, visitor_pose
 from vinesim.cli.demo.progress import PICKER, VISITOR, Statuses, show_progress
 from vinesim.cli.demo.summary import job_summary, write_summary
 from vinesim.client.programs import START_TIMEOUT, program_group
-from vinesim.client.tasks.planning import UnknownTask, plan_meeting
+from vinesim.client.tasks.harvesting import HarvestOptions
+from vinesim.client.tasks.planning import plan_meeting
+from vinesim.client.tasks.registry import UnknownTask
+from vinesim.client.tasks.seen_harvest import SURVEY_TIME
 from vinesim.client.tasks.start_poses import bunch_centres, start_pose
 from vinesim.core.errors import writing
 from vinesim.robot.description.loader import load_description
@@ -25,15 +28,24 @@ JOBS = {
     "pick": ("vinebot", "picked"),
     "exchange": ("logistic", "exchanged"),
     "meet": ("logistic", "handed_over"),
+    "prune": ("vinebot", "pruned"),
 }
 """Default robot, and the key in ``summary.json`` that tells whether the task was done, by task."""
 TIME_LIMIT = 120.0
 """Default limit of the simulated time of a task [s]."""
 
 
+PRUNING_TIME = 400.0
+"""Default limit of the simulated time of pruning one vine [s]."""
+SETTLE_TIME = 2.0
+"""Time after the time-out of a task itself [s], so that its own reason is reported."""
+
+
 def run_job(
     job: str,
     *,
+    harvest: HarvestOptions,
+    see: bool,
     seconds: float | None,
     seed: int | None,
     scene: str | None,
@@ -50,7 +62,7 @@ def run_job(
     check_device(device)
     default_robot, done_key = JOBS[job]
     robot = robot or default_robot
-    scene = scene or "harvest"
+    scene = scene or ("winter_spur" if job == "prune" else "harvest")
     plan = with_seed(load_scene(scene), seed)
     description = load_description(robot)  # raise errors before any process starts
     with writing(out):
@@ -91,8 +103,13 @@ def run_job(
             PICKER,
             "--job",
             job,
+            "--bunches",
+            str(harvest.bunches),
+            "--order",
+            str(harvest.order),
+            *(["--see"] if see else []),
             "--seconds",
-            str(seconds or TIME_LIMIT),
+            str(seconds or time_limit(job, harvest, see)),
             "--out",
             str(out / PICKER),
             "--sensor-hz",
@@ -123,6 +140,15 @@ def run_job(
         )
     console.print(f"pictures and summary.json are in {out}/")
     return 0 if done else 5
+
+
+def time_limit(job: str, harvest: HarvestOptions, see: bool) -> float:
+    """Returns the default limit of the simulated time of a task [s]: a harvest by sight needs time to look around."""
+    if job == "prune":
+        return PRUNING_TIME
+    if job != "pick":
+        return TIME_LIMIT
+    return max(TIME_LIMIT, harvest.timeout + (SURVEY_TIME if see else 0.0)) + SETTLE_TIME
 
 
 def _person_options(scene: Scene) -> list[str]:

@@ -1,22 +1,19 @@
-"""The tasks of a robot client by name, and their plans: paths, picks, box exchanges, meetings."""
+"""Plans of the tasks of a robot client: paths, picks, box exchanges, meetings."""
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 import heapq
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
 from vinesim.client.tasks.start_poses import PlacementError, bunch_centres, ground_clearance
 from vinesim.core import frames
-from vinesim.robot.drives.controlled_robot import Robot
-from vinesim.robot.tasks.meet_person import MeetPerson, MeetPlan
-from vinesim.robot.tasks.pick import PickBunch, PickPlan
-from vinesim.robot.tasks.swap_boxes import SwapBoxes, SwapPlan
-from vinesim.robot.tasks.task import Task
+from vinesim.robot.tasks.meet_person import MeetPlan
+from vinesim.robot.tasks.pick import PickPlan
+from vinesim.robot.tasks.swap_boxes import SwapPlan
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.terrain import above_ground, on_ground
@@ -120,9 +117,14 @@ HAND_LOWER = np.array([-0.45, -0.11, -0.05])
 HAND_UPPER = np.array([0.06, 0.11, 0.09])
 """Upper corner of the box that an open hand sweeps around the grasp [m]; x along the hand, z up."""
 GRASP_HEIGHT = (1.3, 1.75)
+"""[m] Range of heights of the grasp that arm and lift reach easily with a level hand; :data:`REACHED_HEIGHT` is all
+that they reach."""
+REACHED_HEIGHT = (1.2, 1.85)
 """[m] Range of heights of the grasp that arm and lift reach with a level hand."""
 MAX_BUNCH_RADIUS = 0.060
-"""[m] Largest radius of a bunch that fits between the fingers."""
+"""[m] Largest radius of a bunch that fits easily between the fingers; :data:`GRASPED_RADIUS` is the largest at all."""
+GRASPED_RADIUS = 0.068
+"""[m] Largest radius of a bunch that fits between the fingers, 7 mm less than half of their opening."""
 GRASP_DEPTH = 0.06
 """[m] Approximate distance of the grasp below the upper end of a bunch."""
 MIN_HAND_CLEARANCE = 0.005
@@ -160,7 +162,7 @@ def plan_picks(model: Model, near: np.ndarray) -> Iterator[PickPlan]:
             f"no box of this scene has {BASE_CLEARANCE} m of room beside it for a robot; place one in an alley"
         )
     found = False
-    for bunch, side, base, _ in _base_poses(model, near, MIN_HAND_CLEARANCE):
+    for bunch, side, base, _ in base_poses(model, near, MIN_HAND_CLEARANCE):
         beside = [approach for approach in approaches if approach.side == side]
         for approach in sorted(beside, key=lambda approach: float(np.linalg.norm(approach.start - base[:2]))):
             points = find_path(model, base[:2], approach.start, BASE_CLEARANCE)
@@ -184,30 +186,54 @@ def freest_bases(model: Model, near: np.ndarray, distance: float) -> Iterator[tu
     """
     seen: set[int] = set()
     middles = bunch_centres(model)
-    for bunch, side, base, clearance in _base_poses(model, near, -np.inf):
+    for bunch, side, base, clearance in base_poses(model, near, -np.inf, all_reached=True):
         if bunch not in seen and np.linalg.norm(middles[bunch, :2] - near) < distance:
             seen.add(bunch)
             yield bunch, side, base, clearance
 
 
-def _base_poses(model: Model, near: np.ndarray, min_clearance: float) -> Iterator[tuple[int, str, np.ndarray, float]]:
-    """Yields bunch, side, pose [7] of the base and clearance of the hand [m] for all reachable grasps, best first."""
-    points, radius, owner = _obstacles(model)
+def base_poses(
+    model: Model, near: np.ndarray, min_clearance: float, *, all_reached: bool = False
+) -> Iterator[tuple[int, str, np.ndarray, float]]:
+    """Yields bunch, side, pose [7] of the base and clearance of the hand [m] for grasps with at least
+    ``min_clearance`` [m], best first.
+
+    ``all_reached``: also of bunches that are reached with effort (:data:`REACHED_HEIGHT`, :data:`GRASPED_RADIUS`).
+    """
     body_q = model.forward_kinematics(model.joint_settled)[model.bunch_body]
     axis = frames.rotate(body_q[:, 3:], np.array([1.0, 0.0, 0.0]))
     hold = body_q[:, :3] + GRASP_DEPTH * axis
     height = above_ground(model.terrain, hold)
-    fits = (
-        (height > GRASP_HEIGHT[0])
-        & (height < GRASP_HEIGHT[1])
-        & (model.bunch_radius <= MAX_BUNCH_RADIUS)
-        & (axis[:, 2] < -0.95)
+    low, high = REACHED_HEIGHT if all_reached else GRASP_HEIGHT
+    thickest = GRASPED_RADIUS if all_reached else MAX_BUNCH_RADIUS
+    fits = (height > low) & (height < high) & (model.bunch_radius <= thickest) & (axis[:, 2] < -0.95)
+    nearest = np.flatnonzero(fits)
+    away = np.linalg.norm(hold[nearest, :2] - near, axis=1)
+    bunches = np.sort(nearest[np.argsort(away, kind="stable")][:MAX_CANDIDATES])
+    points, radius, owner = _obstacles(model)
+    return grasp_poses(
+        model, near, bunches, hold[bunches], model.bunch_length[bunches], (points, radius, owner), min_clearance
     )
-    bunches = np.flatnonzero(fits)
-    away = np.linalg.norm(hold[bunches, :2] - near, axis=1)
-    bunches = np.sort(bunches[np.argsort(away, kind="stable")][:MAX_CANDIDATES])
-    middle = hold[bunches].mean(0) if len(bunches) else np.zeros(3)
-    reached = np.linalg.norm(hold[bunches] - middle, axis=1).max(initial=0.0) + OBSTACLE_RADIUS
+
+
+def grasp_poses(
+    model: Model,
+    near: np.ndarray,
+    numbers: np.ndarray,
+    hold: np.ndarray,
+    length: np.ndarray,
+    obstacles: tuple[np.ndarray, np.ndarray, np.ndarray],
+    min_clearance: float,
+) -> Iterator[tuple[int, str, np.ndarray, float]]:
+    """Yields number of the bunch, side, pose [7] of the base and clearance of the hand [m] for grasps, best first.
+
+    ``model``: only its ground and fixed pieces are used. ``numbers`` [n] of bunches with their grasps ``hold`` [n, 3] m
+    and lengths ``length`` [n] m. ``obstacles``: spheres around the hand: centres [k, 3] m, radii [k] m, and the number
+    [k] of the bunch that each belongs to, -1 for none.
+    """
+    points, radius, owner = obstacles
+    middle = hold.mean(0) if len(hold) else np.zeros(3)
+    reached = np.linalg.norm(hold - middle, axis=1).max(initial=0.0) + OBSTACLE_RADIUS
     region = np.linalg.norm(points - middle, axis=1) < reached
     points = points[region]
     radius = radius[region]
@@ -217,14 +243,14 @@ def _base_poses(model: Model, near: np.ndarray, min_clearance: float) -> Iterato
     sides = np.stack(
         [frames.rotate(turn, np.array([BUNCH_AHEAD, y, 0.0]))[:, :2] for y in (BUNCH_ASIDE, -BUNCH_ASIDE)], 1
     )
-    base = hold[bunches, None, None, :2] - sides  # [bunch, heading, side, 2]
+    base = hold[:, None, None, :2] - sides  # [bunch, heading, side, 2]
     roomy = (ground_clearance(model, base.reshape(-1, 2)) > BASE_CLEARANCE).reshape(base.shape[:3])
     found = []
-    for i, bunch in enumerate(bunches.tolist()):
-        here = (np.linalg.norm(points - hold[bunch], axis=1) < OBSTACLE_RADIUS) & (owner != bunch)
-        low = HAND_LOWER - [0.0, 0.0, max(float(model.bunch_length[bunch]) - GRASP_DEPTH - 0.05, 0.0)]
+    for i, bunch in enumerate(numbers.tolist()):
+        here = (np.linalg.norm(points - hold[i], axis=1) < OBSTACLE_RADIUS) & (owner != bunch)
+        low = HAND_LOWER - [0.0, 0.0, max(float(length[i]) - GRASP_DEPTH - 0.05, 0.0)]
         looking = np.flatnonzero(roomy[i].any(1))
-        local = frames.rotate(frames.conjugate(turn[looking])[:, None], points[here] - hold[bunch])
+        local = frames.rotate(frames.conjugate(turn[looking])[:, None], points[here] - hold[i])
         beyond = np.maximum(low - local, local - HAND_UPPER)
         apart = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1) + np.minimum(beyond.max(-1), 0.0)
         for j, clear in zip(
@@ -472,42 +498,3 @@ def _waiting_places(model: Model, stand: np.ndarray) -> list[tuple[float, np.nda
             ):
                 found.append((math.atan2(-ahead[1], -ahead[0]), base))
     return found
-
-
-# The tasks of a robot client by name. They are planned before the start and begin when physics and robot exist.
-
-
-TASKS = ("pick", "exchange", "meet")
-"""Names of the tasks that :func:`plan_task` plans."""
-
-
-class UnknownTask(ValueError):
-    """Error: no task has the given name. The message lists all tasks."""
-
-
-def validate_task_name(job: str | None) -> str | None:
-    """Returns the name ``job``, or None. Raises :class:`UnknownTask` if there is no such task."""
-    if job is not None and job not in TASKS:
-        raise UnknownTask(f"no job {job!r}; give {', '.join(TASKS[:-1])} or {TASKS[-1]}")
-    return job
-
-
-def plan_task(job: str, model: Model, near: np.ndarray) -> tuple[Callable[[Physics, Robot], Task], np.ndarray]:
-    """Plan a task. Returns a function that begins it, and the pose [7] at which the robot must start.
-
-    ``near`` [7]: usual start pose of the robot. It takes 1 to 2 s, too long for the real-time loop. Raises
-    :class:`UnknownTask`, and :class:`PlacementError` if the scene has no room for the task.
-    """
-    if validate_task_name(job) == "pick":
-        plan = next(plan_picks(model, near[:2]))
-        return functools.partial(PickBunch, plan=plan), plan.base_pose
-    if job == "meet":
-        return functools.partial(MeetPerson, plan=plan_meeting(model, near)), near
-    boxes = plan_swap(model, near)
-    return functools.partial(_begin_swap, swap=boxes), near
-
-
-def _begin_swap(physics: Physics, robot: Robot, swap: SwapPlan) -> SwapBoxes:
-    """Fill the box that must be full, and begin the exchange."""
-    fill_box(physics, swap.full_box)
-    return SwapBoxes(physics, robot, swap)

@@ -61,6 +61,8 @@ CARRY_SPEED = 0.20
 """[m/s] Speed of the hand with a bunch. GUESSED"""
 RELEASE_OPENING = 0.05
 """[m] Distance by which the fingers open for release. With a larger one they would touch the walls of the box."""
+MAX_MISS = 0.06
+"""[m] Horizontal distance from its place in the box within which a hand that came no lower lets a bunch go. GUESSED"""
 MAX_SLIP = 0.12
 """[m] Distance between bunch and hand above which the bunch has slipped out of the fingers. GUESSED"""
 
@@ -79,6 +81,9 @@ class PickPlan:
     """[n, 2] m, path of the base from ``base_pose`` to where the box is next to it, on the arm's side."""
     final_heading: float
     """[rad] Heading of the base at the end of ``path``."""
+    place: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """[m] Where in the box the bunch is put, from the middle: along the final heading (the end of ``path`` is ahead by
+    as much), across it to the left, and up."""
 
 
 class PickBunch(Task):
@@ -100,11 +105,9 @@ class PickBunch(Task):
         if cutter is None:
             raise CommandError(f"{robot.name} has no gripper with a cutter on its {plan.side} arm; give another robot")
         self._cutter = cutter.frame
-        model = physics.model
-        bunch = plan.bunch
-        self._body = int(model.bunch_body[bunch])
-        self._length = float(model.bunch_length[bunch])
-        self._radius = float(model.bunch_radius[bunch])
+        self._length, self._radius = self._size()
+        self._is_empty = False
+        """Whether the hand is to hold no bunch any more, after a failure."""
         self._fingers = robot.description.joint_indices(self.arm.gripper)
         above = np.linalg.norm(robot.frame_pose(self._cutter)[:3] - robot.frame_pose(self.arm.tool)[:3])
         self._grasp_depth = min(float(above) - STALK_LENGTH, 0.6 * self._length)
@@ -127,16 +130,26 @@ class PickBunch(Task):
         to look."""
         return self._grasp_point()
 
+    def _size(self) -> tuple[float, float]:
+        """Returns length and radius of the bunch [m]."""
+        model = self.physics.model
+        return float(model.bunch_length[self.plan.bunch]), float(model.bunch_radius[self.plan.bunch])
+
     @property
     def mass(self) -> float:
         """Mass of the bunch [kg]."""
-        return float(self.physics.model.body_mass[self._body])
+        return float(self.physics.model.body_mass[self.physics.model.bunch_body[self.plan.bunch]])
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether the bunch has left its vine."""
+        return not self.physics.state.bunch_attached[self.plan.bunch]
 
     @property
     def bunch_pose(self) -> np.ndarray:
         """Pose [7] of the bunch: the origin is its upper end, and x points along its axis."""
         if self.physics.state.bunch_attached[self.plan.bunch]:
-            return self.physics.state.body_q[self._body].astype(float)
+            return self.physics.state.body_q[self.physics.model.bunch_body[self.plan.bunch]].astype(float)
         return self.physics.rigid.bunch_pose(self.plan.bunch)
 
     @property
@@ -160,18 +173,34 @@ class PickBunch(Task):
         phase, once per step."""
         ahead = frames.rotate(self._base_pose()[3:], np.array([1.0, 0.0, 0.0]))
         self.arm.reset()
+        yield from self._reach_and_cut(ahead)
+        yield from self._draw_back(ahead)
+        yield from self._carry()
+
+    def _reach_and_cut(self, ahead: np.ndarray) -> Iterator[str]:
+        """Open the hand, bring it before the bunch, and grasp and cut the bunch."""
         self.robot.command_gripper(self.arm.gripper, 2.0 * (self._radius + OPENING_MARGIN))
         yield from self._move_hand(
             "reach", lambda: self._grasp_point() - APPROACH_DISTANCE * ahead, ahead, timeout=12.0
         )
+        yield from self._advance_and_cut(ahead)
+
+    def _advance_and_cut(self, ahead: np.ndarray) -> Iterator[str]:
+        """Advance around the bunch, close the fingers and cut the stalk."""
         yield from self._move_hand("advance", self._grasp_point, ahead, speed=0.10, timeout=8.0, near=0.003)
         yield from self._close_gripper(ahead)
         yield from self._cut()
+
+    def _draw_back(self, ahead: np.ndarray) -> Iterator[str]:
+        """Draw the bunch back from the plant and to the body."""
         back = self.arm.tip_position - APPROACH_DISTANCE * ahead + [0.0, 0.0, -0.03]
         yield from self._move_hand("back", lambda: back, ahead, speed=0.15, timeout=6.0)
         yield from self._move_hand(
             "tuck", lambda: self._base_to_world(CARRY_POSITION), ahead, speed=CARRY_SPEED, timeout=10.0, near=0.03
         )
+
+    def _carry(self) -> Iterator[str]:
+        """Drive to the box, put the bunch into it, and check that it is there."""
         yield from self._drive()
         yield from self._place_in_box()
         yield from self.wait(1.0, "rest")
@@ -204,7 +233,7 @@ class PickBunch(Task):
             yield "cut"
             while any(blade.closing for blade in self.robot.cutter_blades(self.arm.gripper)):
                 yield "cut"
-            if not self.physics.state.bunch_attached[self.plan.bunch]:
+            if self.is_cut:
                 return
             yield from self.wait(0.2, "cut")
         raise TaskFailed(f"the blades missed the stalk: {self._describe_stalk()}")
@@ -227,17 +256,50 @@ class PickBunch(Task):
         along = frames.rotate(base[3:], np.array([1.0, 0.0, 0.0]))
         rim = float(self.physics.model.box_size[self.plan.box, 2])
         # with the fingers down, the bunch points backwards
-        middle = self.box_pose[:3] + (0.5 * self._length - self._grasp_depth) * along
+        across = frames.cross(np.array([0.0, 0.0, 1.0]), along)
+        place = self.plan.place[0] * along + self.plan.place[1] * across - self.plan.place[2] * down
+        middle = self.box_pose[:3] + place + (0.5 * self._length - self._grasp_depth) * along
         over = middle - (rim + CLEARANCE_ABOVE_RIM) * down
         low = middle - (CRATE_WALL + RELEASE_HEIGHT) * down
         yield from self._move_hand("over", lambda: over, along, speed=CARRY_SPEED, timeout=12.0)
         self._tool_z = along
         yield from self._move_hand("turn", lambda: over, down, timeout=6.0)
-        yield from self._move_hand("lower", lambda: low, down, speed=0.15, timeout=8.0, near=0.03)
+        try:
+            yield from self._move_hand("lower", lambda: low, down, speed=0.15, timeout=8.0, near=0.03)
+        except TaskFailed:  # another bunch or a wall is in the way, or the arm is too short: let go above the place
+            if float(np.linalg.norm((self.arm.tip_position - low)[:2])) > MAX_MISS:
+                raise
         opening = self.robot.gripper_opening(self.arm.gripper)
         self.robot.command_gripper(self.arm.gripper, opening + RELEASE_OPENING)
         yield from self.wait(0.8, "let go")
         yield from self._move_hand("rise", lambda: over, down, speed=0.2, timeout=8.0, near=0.05)
+
+    def withdraw(self) -> Iterator[str]:
+        """After a failure: open the hand, draw it back from the plant and to the body. Yields the phase ``"withdraw"``,
+        once per step.
+
+        Raises :class:`TaskFailed` if the hand does not come free.
+        """
+        self._is_empty = True
+        self._tool_z = np.array([0.0, 0.0, 1.0])
+        ahead = frames.rotate(self._base_pose()[3:], np.array([1.0, 0.0, 0.0]))
+        self.robot.command_gripper(self.arm.gripper, 2.0 * (self._radius + OPENING_MARGIN))
+        for _ in self.wait(0.5, "withdraw"):
+            self.arm.hold_position()
+            yield "withdraw"
+        if self.phase in ("advance", "open", "close", "cut", "back"):
+            back = self.arm.tip_position - APPROACH_DISTANCE * ahead
+            yield from self._move_hand("withdraw", lambda: back, ahead, speed=CARRY_SPEED, timeout=8.0, near=0.05)
+        carry = lambda: self._base_to_world(CARRY_POSITION)  # noqa: E731
+        yield from self._move_hand("withdraw", carry, ahead, speed=CARRY_SPEED, timeout=10.0, near=0.06)
+
+    def fold(self) -> Iterator[str]:
+        """After the release: draw the hand to the body, so that the base can turn. Yields the phase ``"fold"``."""
+        self._is_empty = True
+        self._tool_z = np.array([0.0, 0.0, 1.0])
+        ahead = frames.rotate(self._base_pose()[3:], np.array([1.0, 0.0, 0.0]))
+        carry = lambda: self._base_to_world(CARRY_POSITION)  # noqa: E731
+        yield from self._move_hand("fold", carry, ahead, speed=0.35, timeout=12.0, near=0.05)
 
     # ------------------------------------------------------------------ motions
 
@@ -274,7 +336,7 @@ class PickBunch(Task):
 
     def _check_grasp(self) -> None:
         """Raise :class:`TaskFailed` if the bunch has left its vine and is not in the hand."""
-        if not self.physics.state.bunch_attached[self.plan.bunch]:
+        if self.is_cut and not self._is_empty:
             off = float(np.linalg.norm(self._grasp_point() - self.arm.tip_position))
             if off > MAX_SLIP:
                 raise TaskFailed(f"the bunch slipped out of the fingers, it is {off:.2f} m from them")

@@ -43,7 +43,7 @@ from vinesim.scene.plant_import.ties import tie_to_wires
 from vinesim.scene.plant_import.wood import build_model, join_models
 from vinesim.scene.plant_parameters import VineParameters
 from vinesim.scene.season import SeasonState, load_season
-from vinesim.scene.spare_bodies import with_spares
+from vinesim.scene.spare_bodies import DORMANT_SPARES, SPARES, with_spares
 from vinesim.scene.spec import Clutter, Datum, Scene, Sun, Wind, on_its_date, season_of
 from vinesim.scene.strength import with_reserve
 from vinesim.scene.terrain import Terrain, ground_height
@@ -152,7 +152,7 @@ def _generate(scene: Scene, parameters: VineParameters, terrain: Terrain | None)
             (scene, rng) if one.leaves else None,
         )
         model = join_models(model, tie_to_wires(plant, model, one.tie_gap, parameters.trellis))
-    return with_spares(model)
+    return with_spares(model, DORMANT_SPARES if len(model.canes.body) else SPARES)
 
 
 def _build_leafy(
