@@ -15,6 +15,7 @@ from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.rigid.human_posture import HAND_HALF_THICKNESS
 from vinesim.scene.builder import assemble
 from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.scene.spare_bodies import with_spares
 from vinesim.scene.state import State
 from vinesim.scene.values import POINT_NAMES, Drive, HumanPose, HumanSpec
 from vinesim.world import Physics
@@ -266,6 +267,33 @@ def test_a_cane_is_held():
     np.testing.assert_allclose(hand.force, 100.0 * (hand.controller - hand.pose)[:3], atol=0.02)
     assert np.linalg.norm(hand.force) > 1.0
     assert physics.snapshot().body_q[12, 1] < -0.05
+
+
+@pytest.mark.parametrize("side", ["stump", "piece"])
+def test_a_hand_keeps_the_wood_that_it_holds_when_a_cane_is_cut(side):
+    """A cut beyond the hand leaves the stump in it; a cut before the hand leaves the piece in it."""
+    model = with_spares(assemble([cane((-0.5, 0.0, 1.1))]))
+    physics = Physics(model)
+    spec = eva(0.2, -0.6, 0.5 * np.pi)
+    spec = dataclasses.replace(spec, pose=put(spec.pose, frames.pose(np.array([0.2, -0.1, 1.1]), FORWARD)))
+    physics.add_human(spec)
+    near = move(physics, spec, 0.0, 0.09, 0.0, ticks=60, wait=30)
+    move(physics, near, 0.0, 0.0, 0.0, ticks=40, closed=True)
+    (grasp,) = physics.grasp_manager._grasps.values()
+    held, along = grasp.body, float(grasp.point[0])
+    length = float(model.body_length[held])
+    assert 0.004 < along < length - 0.004
+    physics.cut(held, along + 0.003 if side == "stump" else along - 0.003)
+    for _ in range(100):
+        physics.step()
+    (grasp,) = physics.grasp_manager._grasps.values()
+    stump = int(physics.plants.stumps.table[0, 0])
+    assert grasp.body == (stump if side == "stump" else held)
+    assert physics.hand("eva", "right").held == ("plants", f"body/{grasp.body}")
+    assert physics.plants.held_bodies == [grasp.body]
+    pose = physics.snapshot().body_q[grasp.body].astype(float)
+    point = pose[:3] + frames.rotate(pose[3:], grasp.point)
+    assert np.linalg.norm(point - physics.plants.tie_anchor[grasp.tie]) < 0.03
 
 
 def test_two_hands_carry_a_box():
