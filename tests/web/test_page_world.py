@@ -87,9 +87,8 @@ def test_the_scene_holds_what_cameras_see(shown):
     kinds = np.repeat(arrays["kind"], arrays["size"])
     assert len(kinds) == len(arrays["material"]) == len(arrays["shape"]) == len(arrays["carrier"])
     assert (kinds == 1).sum() == model.bunch_berries.sum()
-    assert ((kinds == 2) & (arrays["material"] == 0) & (arrays["carrier"] < header["bodies"])).sum() == len(
-        model.leaf_body
-    )
+    blades = (kinds == 2) & (arrays["material"] == 0) & (arrays["carrier"] < header["bodies"])
+    assert len(model.leaf_body) <= blades.sum() < 2 * len(model.leaf_body), "each leaf, and small ones in axils"
     assert arrays["first"][0] == 0
     np.testing.assert_array_equal(arrays["first"][1:], np.cumsum(arrays["size"])[:-1])
 

@@ -61,7 +61,7 @@ def gnarled_trunks(
     points[..., 2] = trunk[:, :1, 2] + (points[..., 2] - trunk[:, :1, 2]) * (1.0 - age * _DROP / head)[:, None]
     bend = np.stack([_smooth(g.normal(size=(_KNOTS, 2)), TRUNK_PIECES) for g in rngs])
     free = (4.0 * up * (1.0 - up))[:, None]
-    points[..., :2] += np.sqrt(age) * 0.034 * bend * free
+    points[..., :2] += age * 0.034 * bend * free
     lumps = np.stack([_smooth(g.uniform(-1.0, 1.0, (2 * _KNOTS, 1)), TRUNK_PIECES)[:, 0] for g in rngs])
     foot = 0.35 * np.maximum(1.0 - up / 0.14, 0.0) ** 2
     shoulder = 0.16 * np.maximum(1.0 - (1.0 - up) / 0.2, 0.0)
@@ -93,8 +93,8 @@ def gnarled_arms(
 
 
 def _bends(rng: np.random.Generator) -> np.ndarray:
-    """Returns random displacements [point, 3] m of an old arm: wide bows and short kinks. Younger wood bends less, with
-    the square root of its age: GUESSED."""
+    """Returns random displacements [point, 3] m of an old arm: wide bows and short kinks. Younger arms bend less, with
+    the square root of their age: GUESSED."""
     wide = _smooth(rng.normal(size=(_KNOTS // 2, 3)), ARM_PIECES) * [0.006, 0.016, 0.024]
     return wide + _smooth(rng.normal(size=(_KNOTS, 3)), ARM_PIECES) * [0.006, 0.012, 0.013]
 
