@@ -414,7 +414,7 @@ def test_a_cut_tree_moves_the_same_in_the_kernels_of_gpus(interleave):
 def test_spare_bodies_change_no_bit_of_an_uncut_vineyard(monkeypatch):
     """Swinging trees, every second one fine: the same with and without spare bodies."""
     spared = vineyard.generate_uncached(load_scene("demo"))
-    monkeypatch.setattr(vineyard, "with_spares", lambda model: model)
+    monkeypatch.setattr(vineyard, "with_spares", lambda model, _: model)
     plain = vineyard.generate_uncached(load_scene("demo"))
     motions = []
     for model in (plain, spared):
