@@ -132,8 +132,7 @@ class PageServer:
             port: port to listen on; 0: any free port.
             host: address to listen on.
             tls: serve by https with this context.
-            token: secret in the address; None: the one of this user for the port, or a new one if any port will do,
-                see :mod:`vinesim.web.page_token`.
+            token: secret in the address; None: the one of this user for the port, see :mod:`vinesim.web.page_token`.
             sound: sound from and to pages; None: no sound.
             in_notebook: whether notebooks of this machine may show the page in a frame. No other site may.
 
@@ -144,9 +143,7 @@ class PageServer:
         self._host = host
         self._asked = port
         self._tls = tls
-        if token is None and port:
-            token = page_token.lasting_token(port)
-        self._token = page_token.new_token() if token is None else token
+        self._token = token
         self._in_notebook = in_notebook
         self._files = page_files.served()
         self._worker: ThreadPoolExecutor | None = None
@@ -235,6 +232,7 @@ class PageServer:
             assert runner.server is not None
             self._listener = PageListener(runner.server, self._tls, _NEEDS_HTTPS)
             self.port = self._listener.listen(self._host, self._asked)
+            self._token = self._token or page_token.lasting_token(self.port) or page_token.new_token()
             self._started.set()
             await self._stopping.wait()
         except OSError as failure:
@@ -271,6 +269,7 @@ class PageServer:
                 text=f"this is not {request.url.host}; open the address that the client has printed"
             )
         given = request.match_info.get("token", "")
+        assert self._token is not None
         if not hmac.compare_digest(given.encode(errors="replace"), self._token.encode()):
             text = _NO_SECRET.format(address=f"{self._origin}/")
             if "text/html" in request.headers.get("Accept", ""):

@@ -31,8 +31,8 @@ def lasting_token(port: int) -> str | None:
     """Returns the secret of pages of this user on a port of this machine.
 
     It is the same in every run, so that an open page finds a client that was restarted on the same port. It follows
-    from a file in the folder for caches that only this user can read; a page whose port is new in every run has
-    :func:`new_token`. None if the file can neither be read nor made.
+    from a file in the folder for caches that only this user can read: without the file, all addresses are new. None if
+    the file can neither be read nor made.
     """
     try:
         with disk_cache.exclusive("page-secret", timeout=5.0):
