@@ -135,8 +135,10 @@ class PageListener:
 
     @contextlib.contextmanager
     def serving(self, request: web.BaseRequest) -> Iterator[None]:
-        """The request is served in this context; meanwhile its connection has no time limit."""
-        connection = self._by_protocol[request.protocol]
+        """The request is served in this context; meanwhile its connection has no time limit. Raises ConnectionError if
+        the connection has ended."""
+        if (connection := self._by_protocol.get(request.protocol)) is None:
+            raise ConnectionResetError
         connection.requests += 1
         try:
             yield
@@ -146,7 +148,8 @@ class PageListener:
 
     def know(self, request: web.BaseRequest) -> None:
         """Count the connection of a request no longer as a stranger's: the request had the secret of the page."""
-        self._by_protocol[request.protocol].is_known = True
+        if (connection := self._by_protocol.get(request.protocol)) is not None:
+            connection.is_known = True
 
     async def _accept(self, listener: socket.socket) -> None:
         loop = asyncio.get_running_loop()

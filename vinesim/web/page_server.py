@@ -286,7 +286,8 @@ class PageServer:
         origin = request.headers.get("Origin")
         if origin is not None and origin.split("://")[-1] != request.host:
             raise web.HTTPForbidden(text=f"pages of {origin} may not connect; open {request.url.origin()} itself")
-        is_opened = request.match_info.handler == self._index and request.headers.get("Sec-Fetch-Mode") == "navigate"
+        is_page = request.match_info.handler in (self._index, self._without_slash)
+        is_opened = is_page and request.headers.get("Sec-Fetch-Mode") == "navigate"
         if request.headers.get("Sec-Fetch-Site") in _OTHER_SITES and not is_opened:
             raise web.HTTPForbidden(
                 text="other sites may not use this page; open the address that the client has printed"
