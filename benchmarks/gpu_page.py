@@ -3,7 +3,7 @@
     python benchmarks/gpu_page.py --record demo.page --scene demo    # where vinesim is installed
     python benchmarks/gpu_page.py --play demo.page                   # where a browser and a graphics card are
     python benchmarks/gpu_page.py --play demo.page --software        # without a graphics card: a laptop's page only
-    python benchmarks/gpu_page.py --address http://127.0.0.1:8080/ --software    # the page of a running client
+    python benchmarks/gpu_page.py --address ADDRESS --software    # the page of a running client, as it printed it
 
 A recording holds all messages that a spectator's page receives: the vineyard, the shapes of a robot that pushes a bunch
 and of two people, and the states of some seconds. ``--play`` needs aiohttp, msgspec, numpy and OpenCV. It sends the

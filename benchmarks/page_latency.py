@@ -20,6 +20,7 @@ from vinesim.bench.live_client import own_processes
 from vinesim.client.programs import START_TIMEOUT, free_port
 from vinesim.scene.values import Measurement
 from vinesim.web import array_message
+from vinesim.web.page_token import lasting_address
 
 NAME = "person"
 MOVES = 300
@@ -42,7 +43,9 @@ def page() -> Iterator[Measurement]:
         options = ["--role", "human", "--name", NAME, "--page", str(port), "--status", "json"]
         client = group.start(NAME, "-m", "vinesim", "client", *options)
         client.next_line(START_TIMEOUT)
-        found = asyncio.run(_measure(f"http://127.0.0.1:{port}/"))
+        address = lasting_address(port)
+        assert address is not None, "the folder for caches can be written"
+        found = asyncio.run(_measure(address))
     took = 1e3 * np.array(found["took"])
     yield Measurement("page", "vineyard that a page loads", found["scene_bytes"] / 1e6, "MB")
     yield Measurement("page", "states a second", found["rate"], "Hz")

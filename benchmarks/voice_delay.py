@@ -23,6 +23,7 @@ from benchmarks.support.browser import AS_RECORDED, Page, browser_page, micropho
 from vinesim.bench.live_client import own_processes
 from vinesim.client.programs import START_TIMEOUT, ProgramFailed, ProgramGroup, free_port
 from vinesim.scene.values import Measurement
+from vinesim.web.page_token import lasting_address
 
 _Frames = dict[str, list[tuple[float, str]]]
 """Times [ms] and data of frames, by event."""
@@ -160,7 +161,7 @@ def _start(group: ProgramGroup) -> list[str]:
     for person in people:
         while len(json.loads(person.next_line(START_TIMEOUT))["others"]) < 1:
             pass
-    return [f"http://127.0.0.1:{port}/" for port in ports]
+    return [address for port in ports if (address := lasting_address(port)) is not None]
 
 
 def _stages(said: np.ndarray, took: np.ndarray, times: _Frames) -> np.ndarray:

@@ -396,7 +396,7 @@ def test_the_vineyard_of_a_client_in_a_cell_of_a_notebook():
         assert address.startswith(page.address)
         with urllib.request.urlopen(address, timeout=deadline(60.0)) as answer:
             assert b"vinesim" in answer.read()
-            assert "frame-ancestors" not in answer.headers["Content-Security-Policy"]
+            assert "frame-ancestors 'self' http://localhost:* " in answer.headers["Content-Security-Policy"]
             assert "X-Frame-Options" not in answer.headers
         client.step()
     with pytest.raises(urllib.error.URLError, match="refused"):  # the page ends with the client

@@ -18,5 +18,7 @@ class _NoWorld:
 def page_module(page: Page, name: str, *imported: str) -> Iterator[Callable[[str], Any]]:
     """A function that evaluates a script in which what is ``imported`` from a module is known, and gives its value."""
     with PageServer(cast(World, _NoWorld())) as server:
-        page.open(server.address + "package.json")  # of the page's files one that starts no script
-        yield lambda script: page.run(f"import('/{name}').then(({{ {', '.join(imported)} }}) => {{ {script} }})")
+        page.open(server.address + "check.js")  # a script that is opened as a page is only shown
+        yield lambda script: page.run(
+            f"import('{server.address}{name}').then(({{ {', '.join(imported)} }}) => {{ {script} }})"
+        )

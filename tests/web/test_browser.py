@@ -419,7 +419,7 @@ def test_a_headset_moves_head_and_hands(page):
         assert [line for line, _ in wrist["lines"][1 : len(INTENTIONS)]] == list(INTENTIONS[1:])
         assert wrist["away"] < 0.25, "it is at the left hand [m]"
         page.run("vinesim.viewer.shears.told.length = 0, document.getElementById('notices').replaceChildren()")
-        page.run("import('/notices.js').then(({ say }) => say('A bunch was cut.')).then(() => 0)")
+        page.run("import(new URL('notices.js', location)).then(({ say }) => say('A bunch was cut.')).then(() => 0)")
         wait(lambda: page.run(WRIST)["lines"][-1] == ["A bunch was cut.", False], "sentences are read at the wrist")
         page.run("device.primaryInputMode = 'hand', device.hands.right.position.set(0.2, 1.3, -0.5), 0")
         page.run("device.hands.right.quaternion.set(0, 0, 0, 1), 0")

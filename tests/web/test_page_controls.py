@@ -103,7 +103,9 @@ def show_everything(page, live):
     wait(lambda: page.run("vinesim.viewer.labels.has('anna')"), "a name is shown")
     page.run("""Object.assign(document.getElementById('names').appendChild(document.createElement('div')),
       { className: 'owner', textContent: 'tree/1: anna' }), 0""")
-    page.run("import('/notices.js').then(({ say }) => say('A sentence.', { stays: true })).then(() => 0)")
+    page.run(
+        "import(new URL('notices.js', location)).then(({ say }) => say('A sentence.', { stays: true })).then(() => 0)"
+    )
     page.run("""['timeline', 'failure', 'enter'].forEach((id) => { document.getElementById(id).hidden = false; });
       document.querySelector('#timeline select').append(new Option('1 x', 1));
       document.querySelector('#timeline span').textContent = '1.0 / 2.0 s';

@@ -3,8 +3,11 @@
 import asyncio
 import json
 import re
+import socket
 import ssl
+import threading
 import urllib.error
+import urllib.parse
 import urllib.request
 
 import aiohttp
@@ -15,8 +18,9 @@ from hypothesis import strategies as st
 
 from tests.support.waiting import deadline, wait
 from vinesim.client.page import page_access
+from vinesim.client.programs import free_port
 from vinesim.core.errors import UsageError
-from vinesim.web import page_files
+from vinesim.web import page_files, page_token
 from vinesim.web.page_input import decode_input
 from vinesim.web.page_server import WINDOW, PageServer
 
@@ -258,18 +262,202 @@ def test_other_machines_need_the_token_and_get_https(tmp_path, monkeypatch):
     access = page_access.network_access()
     trusting = ssl.create_default_context(cafile=tmp_path / "page-certificate" / "ca.pem")
     with PageServer(CountingWorld(), 0, access.host, tls=access.tls, token=access.token) as server:
-        assert server.address.startswith(f"https://{access.host}:{server.port}/?token=")
-        plain = server.address.split("?")[0]
-        for path in ("", "scene", "main.js", "?token=", "?token=x", "state"):
+        plain = f"https://{access.host}:{server.port}/"
+        assert server.address == f"{plain}{access.token}/"
+        for path in ("", "scene", "main.js", "x/", "x/scene", f"{access.token[:-1]}/", "state"):
             with pytest.raises(urllib.error.HTTPError, match="403"):
                 urllib.request.urlopen(plain + path, timeout=deadline(10.0), context=trusting)
         with pytest.raises(urllib.error.HTTPError, match="400") as refusal:
             urllib.request.urlopen(plain.replace("https", "http"), timeout=deadline(10.0))
         assert "needs https" in refusal.value.read().decode(), "a sentence for plain http"
-        browser = urllib.request.build_opener(
-            urllib.request.HTTPSHandler(context=trusting), urllib.request.HTTPCookieProcessor()
-        )
-        assert b"vinesim" in browser.open(server.address, timeout=deadline(10.0)).read()
-        assert browser.open(plain + "scene", timeout=deadline(10.0)).read() == b"scene", (
-            "a cookie holds the token from then on"
-        )
+        for path, part in (("", b"vinesim"), ("scene", b"scene")):
+            with urllib.request.urlopen(server.address + path, timeout=deadline(10.0), context=trusting) as answer:
+                assert part in answer.read()
+
+
+def get(address, **headers):
+    """Status, headers and text of the answer to a request."""
+    request = urllib.request.Request(address, headers={name.replace("_", "-"): one for name, one in headers.items()})
+    try:
+        with urllib.request.urlopen(request, timeout=deadline(10.0)) as answer:
+            return answer.status, answer.headers, answer.read().decode()
+    except urllib.error.HTTPError as refusal:
+        return refusal.code, refusal.headers, refusal.read().decode()
+
+
+def test_on_this_machine_too_the_page_needs_its_whole_address(served):
+    """Other users of the machine reach the port, but do not know the secret."""
+    _, server = served
+    bare = f"http://127.0.0.1:{server.port}/"
+    for path in ("", "scene", "plants?x=0&y=0&z=0", "rigid", "state", "main.js", "x/scene", "%ff%00/scene", "\udcff/"):
+        status, headers, text = get(bare + urllib.parse.quote(path, safe="/?=&%", errors="surrogateescape"))
+        assert status == 403, path
+        assert f"in a browser: {bare}" in text, "it is said where the whole address is printed"
+    status, headers, text = get(bare, Accept="text/html,*/*")
+    assert (status, headers.get_content_type()) == (403, "text/html")
+    assert "<p>" in text
+    assert headers["X-Frame-Options"] == "DENY"
+    assert server.address.removeprefix(bare).removesuffix("/") not in text
+    assert get(server.address.removesuffix("/"))[0] == 200, "the slash at the end may be missing"
+    assert get(server.address.removesuffix("/"))[2] == get(server.address)[2]
+
+
+def test_pages_of_one_machine_do_not_disturb_each_other():
+    """Cookies are shared by all ports of a machine. So the secret is not in a cookie."""
+    browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+    with PageServer(CountingWorld()) as one, PageServer(CountingWorld()) as other:
+        assert one.address.split("/")[3] != other.address.split("/")[3]
+        for server in (one, other, one):
+            for path in ("", "scene"):
+                answer = browser.open(server.address + path, timeout=deadline(10.0))
+                assert (answer.status, answer.headers["Set-Cookie"]) == (200, None)
+
+
+def test_a_client_that_was_restarted_on_its_port_has_the_same_address(tmp_path, monkeypatch):
+    monkeypatch.setenv("VINESIM_CACHE", str(tmp_path / "cache"))
+    port = free_port()
+    address = page_token.lasting_address(port)
+    for _ in range(2):
+        with PageServer(CountingWorld(), port) as server:
+            assert server.address == address
+            assert get(address + "scene")[0] == 200
+    assert page_token.lasting_address(port + 1).split("/")[3] != address.split("/")[3]
+    secret = tmp_path / "cache" / "page-secret"
+    assert secret.stat().st_mode & 0o777 == 0o600, "no other user can read it"
+    secret.chmod(0o644)
+    assert page_token.lasting_address(port) != address, "a secret that others could read is replaced"
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("VINESIM_CACHE", str(tmp_path / "file" / "cache"))
+    assert page_token.lasting_address(port) is None
+    with PageServer(CountingWorld(), port) as server:
+        assert get(server.address + "scene")[0] == 200, "the address is new, and the page works"
+
+
+@pytest.mark.parametrize("in_notebook", [False, True])
+def test_only_notebooks_of_this_machine_may_frame_a_page_and_only_one_made_for_them(in_notebook):
+    with PageServer(CountingWorld(), in_notebook=in_notebook) as server:
+        _, headers, _ = get(server.address, Sec_Fetch_Site="cross-site", Sec_Fetch_Mode="navigate")
+    (ancestors,) = [
+        rule.split(" ", 1)[1]
+        for rule in headers["Content-Security-Policy"].split("; ")
+        if rule.startswith("frame-ancestors ")
+    ]
+    if in_notebook:
+        assert {"http://localhost:*", "http://127.0.0.1:*", "vscode-webview:"} < set(ancestors.split())
+        assert not {"*", "http:", "https:"} & set(ancestors.split())
+        assert headers["X-Frame-Options"] is None, "it would forbid all frames"
+    else:
+        assert ancestors == "'none'"
+        assert headers["X-Frame-Options"] == "DENY"
+
+
+@pytest.mark.parametrize("site", ["cross-site", "same-site"])
+def test_requests_of_other_sites_are_refused_before_any_work(served, site):
+    """Such as of <img src=...>, which have no Origin. A server on another port of this machine is "same-site"."""
+    world, server = served
+    world.scene = world.rigid = world.plants = None  # any work would fail with 500
+    for path in ("scene", "rigid", "plants?x=0&y=0&z=0", "state", "main.js", ""):
+        for mode in ("no-cors", "cors", "websocket"):
+            status, _, text = get(server.address + path, Sec_Fetch_Site=site, Sec_Fetch_Mode=mode)
+            assert status == 403, path
+            assert "other sites" in text
+    assert get(server.address, Sec_Fetch_Site=site, Sec_Fetch_Mode="navigate")[0] == 200, "a link to the page"
+    assert get(server.address + "main.js", Sec_Fetch_Site="same-origin", Sec_Fetch_Mode="cors")[0] == 200
+
+
+def test_only_files_of_the_page_are_served(served):
+    _, server = served
+    for name in (".npmrc", "package.json", "package-lock.json", ".gitignore", "vendor/LICENSE", "vendor/", "vendor"):
+        assert get(server.address + name)[0] == 404, name
+    folder = page_files.PAGE
+    for path in (folder / ".npmrc", folder / "package.json"):
+        assert path.is_file(), "the test asks for files that exist"
+    for name in page_files.served():
+        assert get(server.address + name)[0] == 200
+
+
+def ask(port, head):
+    """First line of the answer to the bytes of a request."""
+    with socket.create_connection(("127.0.0.1", port), timeout=deadline(10.0)) as connection:
+        connection.sendall(head)
+        return connection.makefile("rb").readline().decode().strip()
+
+
+@pytest.mark.parametrize(
+    "hosts",
+    [
+        [],
+        [b"127.0.0.1:{port}", b"127.0.0.1:{port}"],
+        *(
+            [one]
+            for one in (
+                b"",
+                b":",
+                b"[",
+                b"[::1",
+                b"]:80",
+                b"a:b",
+                b"a:99999",
+                b"a b",
+                b"a@b",
+                b"a/b",
+                b"\xff\xfe",
+                b"::1",
+            )
+        ),
+    ],
+)
+def test_a_malformed_host_is_a_bad_request(served, hosts, caplog):
+    _, server = served
+    path = server.address.split("/", 3)[3].encode()
+    lines = [b"Host: " + host.replace(b"{port}", str(server.port).encode()) for host in hosts]
+    for line in (path + b"scene", b"", b"scene"):
+        request = b"\r\n".join([b"GET /" + line + b" HTTP/1.1", *lines, b"", b""])
+        assert ask(server.port, request).split()[1] == "400", request
+    assert caplog.records == [], "strangers do not fill the log"
+
+
+def test_malformed_requests_do_not_fill_the_log(served, caplog):
+    _, server = served
+    for request in (
+        b"\x16\x03\x01\r\n\r\n",
+        b"GET\r\n\r\n",
+        b"GET http://[/ HTTP/1.1\r\nHost: a\r\n\r\n",
+        b"A" * 20_000,
+    ):
+        assert ask(server.port, request).split()[1] == "400", request
+    assert get(server.address + "scene")[0] == 200
+    assert caplog.records == []
+
+
+def test_states_and_files_are_served_while_a_vineyard_is_laid_out(served):
+    """The first layout of a large vineyard takes seconds."""
+    world, server = served
+    begun, finish = threading.Event(), threading.Event()
+
+    def lay_out():
+        begun.set()
+        assert finish.wait(deadline(30.0))
+        return b"scene"
+
+    world.scene = lay_out
+
+    async def page():
+        loop = asyncio.get_running_loop()
+        async with aiohttp.ClientSession() as session, session.ws_connect(server.address + "state") as socket:
+            scene = loop.create_task(session.get(server.address + "scene"))
+            try:
+                while not begun.is_set():
+                    await asyncio.sleep(0.002)
+                advance(world, server, 1)
+                assert (await socket.receive(timeout=deadline(10.0))).data == b"0"
+                async with session.get(
+                    server.address + "main.js", timeout=aiohttp.ClientTimeout(deadline(10.0))
+                ) as file:
+                    assert file.status == 200
+                assert not scene.done()
+            finally:
+                finish.set()
+            return await (await scene).read()
+
+    assert asyncio.run(page()) == b"scene"

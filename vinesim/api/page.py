@@ -28,7 +28,7 @@ class Page:
         """
         page_files.check()
         world = PageWorld(client)
-        self._server = PageServer(world, port)
+        self._server = PageServer(world, port, in_notebook=True)
         self._server.__enter__()
         self._posts = client.post_step
         self._collect: Callable[[Client], None] = lambda _: world.collect(self._server)
@@ -36,7 +36,7 @@ class Page:
 
     @property
     def address(self) -> str:
-        """Address to open in a browser on this machine."""
+        """Address to open in a browser on this machine. It contains a secret: only who knows it can open the page."""
         return self._server.address
 
     def close(self) -> None:

@@ -10,20 +10,23 @@ from __future__ import annotations
 import asyncio
 import collections
 import hmac
+import html
 import logging
+import re
 import ssl
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol, Self
 
 import numpy as np
 from aiohttp import WSMsgType, web
+from aiohttp.http_exceptions import HttpProcessingError
 
 from vinesim.core.errors import UsageError
-from vinesim.web import page_files
-from vinesim.web.https_site import HttpsSite
-from vinesim.web.page_files import PAGE
+from vinesim.web import page_files, page_token
 from vinesim.web.page_input import PageInput, decode_input, decode_place
+from vinesim.web.page_listener import IDLE_TIMEOUT, PageListener
 from vinesim.web.voice_socket import Sound, VoiceSocket
 
 log = logging.getLogger(__name__)
@@ -33,26 +36,49 @@ WINDOW = 2
 machine was 0.4 to 1 s late."""
 _MAX_INPUT = 8192
 """Longest message of a page [B]."""
-_NEEDS_HTTPS = "this page needs https: open the address that the client has printed, with https:// and its token"
+_NEEDS_HTTPS = "this page needs https: open the whole address that the client has printed, with https://"
 """Answer to requests by plain http."""
 _THIS_MACHINE = ("localhost", "127.0.0.1", "::1")
-_POLICY = "; ".join(
-    (
-        "default-src 'self'",
-        "style-src 'self' 'unsafe-inline'",
-        "img-src 'self' data:",
-        "media-src 'self' blob:",
-        "worker-src 'self' blob:",
-        "object-src 'none'",
-        "base-uri 'none'",
-    )
+_POLICY = (
+    "default-src 'self'",
+    "style-src 'self' 'unsafe-inline'",
+    "img-src 'self' data:",
+    "media-src 'self' blob:",
+    "worker-src 'self' blob:",
+    "object-src 'none'",
+    "base-uri 'none'",
+    "form-action 'none'",
 )
 """Content Security Policy: the page can load nothing from other hosts, whatever its scripts request."""
+_NO_FRAMES = "frame-ancestors 'none'"
+_NOTEBOOKS = " ".join(
+    (
+        "frame-ancestors 'self'",
+        *(f"{scheme}://{host}:*" for scheme in ("http", "https") for host in ("localhost", "127.0.0.1")),
+        "vscode-webview:",
+        "vscode-file:",
+    )
+)
+"""Rule for the page in a cell of a notebook: Jupyter on this machine, and Visual Studio Code, may frame it."""
+_HOST = re.compile(r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+)(?::([0-9]{1,5}))?", re.ASCII)
+"""A host, and a port if it is not the usual one (RFC 9110, section 7.2)."""
+_OTHER_SITES = ("cross-site", "same-site")
+"""Values of ``Sec-Fetch-Site`` of requests from other sites. A page on another port of this machine is "same-site"."""
+_NO_SECRET = """This is a vineyard of vinesim, but the address is not complete. The whole address has a secret in its
+path, so that nobody else can look into the vineyard or control its person.
+
+The client prints the whole address when it starts: in the terminal of vinesim client, demo or replay, look for the line
+with "in a browser: {address}...". In Python, client.page().address is the address."""
+"""Answer to requests without the page's secret."""
+_HEADERS = {"X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer", "Cache-Control": "no-cache"}
+"""Headers of all files of the page."""
 
 
 class World(Protocol):
-    """Interface of an object that provides the world to pages (connected browser tabs) and takes their input. All
-    methods are called in the server's thread.
+    """Interface of an object that provides the world to pages (connected browser tabs) and takes their input.
+
+    :meth:`scene` and :meth:`plants` may take long. They are called in a thread of their own, one at a time, while pages
+    receive states. All other methods are called in the server's thread.
 
     Messages are encoded by :mod:`vinesim.web.array_message`.
     """
@@ -97,6 +123,7 @@ class PageServer:
         tls: ssl.SSLContext | None = None,
         token: str | None = None,
         sound: Sound | None = None,
+        in_notebook: bool = False,
     ) -> None:
         """Start the server of a world.
 
@@ -105,8 +132,9 @@ class PageServer:
             port: port to listen on; 0: any free port.
             host: address to listen on.
             tls: serve by https with this context.
-            token: secret that browsers must have in the address; None: no secret is needed.
+            token: secret in the address; None: the one of this user for the port, see :mod:`vinesim.web.page_token`.
             sound: sound from and to pages; None: no sound.
+            in_notebook: whether notebooks of this machine may show the page in a frame. No other site may.
 
         Raises :class:`UsageError` if files of the page are missing or the port is taken.
         """
@@ -116,6 +144,10 @@ class PageServer:
         self._asked = port
         self._tls = tls
         self._token = token
+        self._in_notebook = in_notebook
+        self._files = page_files.served()
+        self._worker: ThreadPoolExecutor | None = None
+        self._listener: PageListener | None = None
         self.voice = None if sound is None else VoiceSocket(sound)
         """The web socket for sound."""
         self.port = 0
@@ -132,10 +164,13 @@ class PageServer:
 
     @property
     def address(self) -> str:
-        """Address of the page for a browser."""
-        scheme = "http" if self._tls is None else "https"
-        token = "" if self._token is None else f"?token={self._token}"
-        return f"{scheme}://{self._host}:{self.port}/{token}"
+        """Address of the page for a browser, with its secret."""
+        return f"{self._origin}/{self._token}/"
+
+    @property
+    def _origin(self) -> str:
+        host = f"[{self._host}]" if ":" in self._host else self._host
+        return f"{'http' if self._tls is None else 'https'}://{host}:{self.port}"
 
     @property
     def has_viewers(self) -> bool:
@@ -176,26 +211,28 @@ class PageServer:
 
     async def _serve(self) -> None:
         self._stopping = asyncio.Event()
-        app = web.Application(middlewares=[_refuse_other_origins, self._refuse_strangers])
-        app.router.add_get("/", self._index)
-        app.router.add_get("/scene", self._scene)
-        app.router.add_get("/plants", self._plants)
-        app.router.add_get("/rigid", self._rigid)
-        app.router.add_get("/state", self._state)
+        self._worker = ThreadPoolExecutor(1, "page layout")
+        app = web.Application(
+            middlewares=[self._serving, _refuse_invalid_hosts, self._refuse_strangers, self._refuse_sites]
+        )
+        app.router.add_get("/{token}", self._without_slash)
+        app.router.add_get("/{token}/", self._index)
+        app.router.add_get("/{token}/scene", self._scene)
+        app.router.add_get("/{token}/plants", self._plants)
+        app.router.add_get("/{token}/rigid", self._rigid)
+        app.router.add_get("/{token}/state", self._state)
         if self.voice is not None:
-            app.router.add_get("/voice", self.voice.serve)
-        app.router.add_static("/", PAGE)
-        site: HttpsSite | None = None
-        runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
+            app.router.add_get("/{token}/voice", self.voice.serve)
+        app.router.add_get("/{token}/{file:.+}", self._file)
+        runner = web.AppRunner(
+            app, access_log=None, shutdown_timeout=1.0, keepalive_timeout=IDLE_TIMEOUT, logger=_request_log()
+        )
         await runner.setup()
         try:
-            if self._tls is None:
-                await web.TCPSite(runner, self._host, self._asked).start()
-                self.port = runner.addresses[0][1]
-            else:
-                assert runner.server is not None
-                site = HttpsSite(runner.server, self._tls, _NEEDS_HTTPS)
-                self.port = site.listen(self._host, self._asked)
+            assert runner.server is not None
+            self._listener = PageListener(runner.server, self._tls, _NEEDS_HTTPS)
+            self.port = self._listener.listen(self._host, self._asked)
+            self._token = self._token or page_token.lasting_token(self.port) or page_token.new_token()
             self._started.set()
             await self._stopping.wait()
         except OSError as failure:
@@ -205,43 +242,85 @@ class PageServer:
                 event.set()
             if self.voice is not None:
                 await self.voice.close()
-            if site is not None:
-                await site.close()
+            if self._listener is not None:
+                await self._listener.close()
             await runner.cleanup()
+            self._worker.shutdown(cancel_futures=True)
 
     def _wake(self) -> None:
         for event in self._fresh:
             event.set()
 
     @web.middleware
-    async def _refuse_strangers(self, request: web.Request, handler: Callable[..., Any]) -> web.StreamResponse:
-        """Refuse requests without permission.
+    async def _serving(self, request: web.Request, handler: Callable[..., Any]) -> web.StreamResponse:
+        assert self._listener is not None
+        with self._listener.serving(request):
+            return await handler(request)
 
-        If the server has a token, a request must have the token in the address, or in the cookie that the server then
-        sets. Without a token, the request must use a host name of this machine, because any site can make its own name
-        point to this address.
+    @web.middleware
+    async def _refuse_strangers(self, request: web.Request, handler: Callable[..., Any]) -> web.StreamResponse:
+        """Refuse requests without the page's secret in their path.
+
+        By http, a request must use a host name of this machine, too, because any site can make its own name point to
+        this address.
         """
-        given = request.query.get("token", request.cookies.get("token", ""))
-        if self._token is not None and not hmac.compare_digest(given.encode(), self._token.encode()):
-            raise web.HTTPForbidden(text="open the address with its token, as the client has printed it")
-        if self._token is None and request.url.host not in (self._host, *_THIS_MACHINE):
-            raise web.HTTPForbidden(text=f"this is not {request.url.host}; open {self.address}")
+        if self._tls is None and request.url.host not in (self._host, *_THIS_MACHINE):
+            raise web.HTTPForbidden(
+                text=f"this is not {request.url.host}; open the address that the client has printed"
+            )
+        given = request.match_info.get("token", "")
+        assert self._token is not None
+        if not hmac.compare_digest(given.encode(errors="replace"), self._token.encode()):
+            text = _NO_SECRET.format(address=f"{self._origin}/")
+            if "text/html" in request.headers.get("Accept", ""):
+                raise web.HTTPForbidden(text=_sheet(text), content_type="text/html", headers=self._index_headers())
+            raise web.HTTPForbidden(text=text, headers=_HEADERS)
+        assert self._listener is not None
+        self._listener.know(request)
         return await handler(request)
 
+    @web.middleware
+    async def _refuse_sites(self, request: web.Request, handler: Callable[..., Any]) -> web.StreamResponse:
+        """Refuse requests of other sites that are open in the same browser. Only the page itself may be opened from
+        elsewhere, by a link or in the frame of a notebook."""
+        origin = request.headers.get("Origin")
+        if origin is not None and origin.split("://")[-1] != request.host:
+            raise web.HTTPForbidden(text=f"pages of {origin} may not connect; open {request.url.origin()} itself")
+        is_page = request.match_info.handler in (self._index, self._without_slash)
+        is_opened = is_page and request.headers.get("Sec-Fetch-Mode") == "navigate"
+        if request.headers.get("Sec-Fetch-Site") in _OTHER_SITES and not is_opened:
+            raise web.HTTPForbidden(
+                text="other sites may not use this page; open the address that the client has printed"
+            )
+        return await handler(request)
+
+    def _index_headers(self) -> dict[str, str]:
+        policy = "; ".join((*_POLICY, _NOTEBOOKS if self._in_notebook else _NO_FRAMES))
+        frames = {} if self._in_notebook else {"X-Frame-Options": "DENY"}
+        return {**_HEADERS, **frames, "Content-Security-Policy": policy}
+
+    async def _without_slash(self, request: web.Request) -> web.Response:
+        raise web.HTTPPermanentRedirect(f"/{self._token}/" + (f"?{request.query_string}" if request.query else ""))
+
     async def _index(self, _: web.Request) -> web.FileResponse:
-        headers = {"Cache-Control": "no-cache", "Content-Security-Policy": _POLICY}
-        page = web.FileResponse(PAGE / "index.html", headers=headers)
-        if self._token is not None:
-            page.set_cookie("token", self._token, httponly=True, samesite="Strict", secure=self._tls is not None)
-        return page
+        return web.FileResponse(self._files["index.html"], headers=self._index_headers())
+
+    async def _file(self, request: web.Request) -> web.FileResponse:
+        if (path := self._files.get(request.match_info["file"])) is None:
+            raise web.HTTPNotFound(text="the page has no such file")
+        return web.FileResponse(path, headers=_HEADERS)
+
+    async def _made(self, make: Callable[..., bytes], *arguments: Any) -> web.Response:
+        """Answer with what ``make`` returns; it runs in a thread of its own, so that states and sound go on."""
+        return _binary(await asyncio.get_running_loop().run_in_executor(self._worker, make, *arguments))
 
     async def _scene(self, _: web.Request) -> web.Response:
-        return _binary(self._world.scene())
+        return await self._made(self._world.scene)
 
     async def _plants(self, request: web.Request) -> web.Response:
         if (place := decode_place(request.query)) is None:
             raise web.HTTPBadRequest(text="no place: give x, y and z in metres, each from -1e5 to 1e5")
-        return _binary(self._world.plants(place))
+        return await self._made(self._world.plants, place)
 
     async def _rigid(self, _: web.Request) -> web.Response:
         return _binary(self._world.rigid())
@@ -297,13 +376,34 @@ class PageServer:
 
 
 def _binary(body: bytes) -> web.Response:
-    return web.Response(body=body, content_type="application/octet-stream", headers={"Cache-Control": "no-store"})
+    headers = {**_HEADERS, "Cache-Control": "no-store"}
+    return web.Response(body=body, content_type="application/octet-stream", headers=headers)
 
 
 @web.middleware
-async def _refuse_other_origins(request: web.Request, handler: Callable[..., Any]) -> web.StreamResponse:
-    """Refuse requests of other sites that are open in the same browser."""
-    origin = request.headers.get("Origin")
-    if origin is not None and origin.split("://")[-1] != request.host:
-        raise web.HTTPForbidden(text=f"pages of {origin} may not connect; open {request.url.origin()} itself")
+async def _refuse_invalid_hosts(request: web.Request, handler: Callable[..., Any]) -> web.StreamResponse:
+    """Refuse requests whose ``Host`` is missing, doubled or malformed."""
+    hosts = request.headers.getall("Host", [])
+    found = _HOST.fullmatch(hosts[0]) if len(hosts) == 1 else None
+    if found is None or int(found[2] or 0) > 65535:
+        raise web.HTTPBadRequest(text="a request needs one valid Host")
     return await handler(request)
+
+
+def _sheet(text: str) -> str:
+    """Returns sentences as a small page in HTML."""
+    paragraphs = "".join(f"<p>{html.escape(part)}</p>" for part in text.split("\n\n"))
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>vinesim</title>'
+        '<meta name="viewport" content="width=device-width, initial-scale=1"><link rel="icon" href="data:,"></head>'
+        '<body style="max-width: 40em; margin: 3em auto; padding: 0 1em; font: 16px/1.5 system-ui, sans-serif">'
+        f"{paragraphs}</body></html>"
+    )
+
+
+def _request_log() -> logging.Logger:
+    """Returns a log for errors of the aiohttp server, without those of malformed requests: strangers could fill it."""
+    found = logging.getLogger(f"{__name__}.requests")
+    if not found.filters:
+        found.addFilter(lambda record: not (record.exc_info and isinstance(record.exc_info[1], HttpProcessingError)))
+    return found

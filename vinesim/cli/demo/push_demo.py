@@ -23,6 +23,7 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene, with_seed
 from vinesim.scene.values import SENSOR_KINDS
 from vinesim.web import page_files
+from vinesim.web.page_token import lasting_address
 
 VISITOR_SENSOR_HZ = "1"
 """Rate of the visitor's sensors [Hz], low because the demo only needs them to exist."""
@@ -79,17 +80,18 @@ def run_push(
         console.print(f"server on {endpoint}; {PICKER} will push bunch {bunch} for {seconds:.0f} s")
         common = ["--connect", endpoint, "--scene", scene, "--robot", robot, "--device", device]
         common += [] if seed is None else ["--seed", str(seed)]
-        no_page = page_files.missing()
-        page = None if no_page else free_port()
-        clients = _start_clients(group, common, bunch, poses, page, out)
+        port = free_port()
+        address = lasting_address(port)
+        no_page = page_files.missing() or (None if address else "the folder for caches cannot be written")
+        clients = _start_clients(group, common, bunch, poses, None if no_page else port, out)
         newest = Statuses()
         ready = wait_until_ready(clients, [server], listener, newest, topics.describe, console, START_TIMEOUT)
         took = time.time() - begin
         console.print(f"all ready after {took:.1f} s; {seconds:.0f} s to go", highlight=False)
-        if page is None:
+        if no_page:
             console.print(f"nothing to watch in a browser: {no_page}")
         else:
-            console.print(f"watch it in a browser: http://127.0.0.1:{page}/", highlight=False)
+            console.print(f"watch it in a browser: {address}", highlight=False, soft_wrap=True)
         timer = _RunTimer(newest[PICKER]["time"] + seconds, listener)
         show_progress(clients[PICKER], clients[VISITOR], server, newest, console, headless, timer.is_over)
         received = {} if listener is None else listener.report()

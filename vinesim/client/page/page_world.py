@@ -116,6 +116,8 @@ class PageWorld:
         self._sway: Sway | None = None
         self._primitives: Primitives | None = None
         """Primitives of the world; None until a page requests them."""
+        self._layout_lock = threading.Lock()
+        """Held while primitives are read for a page, and while they follow rigid bodies that came or went."""
         self._lock = threading.Lock()
         self._snapshot: tuple[int, Snapshot] | None = None
         self._rigid_version = 0
@@ -231,7 +233,7 @@ class PageWorld:
         if self._sway is not None:
             self._sway = Sway(self._client.model)
 
-    # ------------------------------------------------------------------ in the server's thread
+    # ------------------------------------------------------------------ in the server's thread for layouts
 
     def scene(self) -> bytes:
         """Returns the message with which a page starts: everything that does not change while the page is open.
@@ -251,7 +253,8 @@ class PageWorld:
         sun = scene.sun.direction(0.0)
         grid, nodes = _terrain_grid(model.terrain)
         start = self._start_view()
-        reach, plants = _nearest(primitives, start[:3], self._most)
+        with self._layout_lock:
+            reach, plants = _nearest(primitives, start[:3], self._most)
         return array_message.encode(
             {
                 "scene": scene.name,
@@ -301,7 +304,9 @@ class PageWorld:
 
         A page requests it in a vineyard that is too large to be loaded as a whole.
         """
-        reach, plants = _nearest(self._lay_out(), place, self._most)
+        primitives = self._lay_out()
+        with self._layout_lock:
+            reach, plants = _nearest(primitives, place, self._most)
         return array_message.encode({"reach": reach, "place": place.tolist()}, plants)
 
     def _lay_out(self) -> Primitives:
@@ -312,13 +317,15 @@ class PageWorld:
             self._primitives = Primitives(self._client.model, grass=GRASS)
         return self._primitives
 
+    # ------------------------------------------------------------------ in the server's thread
+
     def rigid(self) -> bytes:
         """Returns a message with the shapes of the present robots, people, boxes and picked bunches."""
         return self._rigid
 
     def state(self, since: int, page: int = -1) -> tuple[int, bytes] | None:
         """Returns the newest state as a message, with its tick before it; None if the state is not newer than tick
-        ``since``.
+        ``since``, or if rigid bodies came or went while primitives are read for a page; the next state then has them.
 
         The message contains the poses of the bodies of trees that moved after tick ``since``, the poses of all rigid
         bodies, and which bunches are picked. For a person it also says which page controls the person: ``page``, which
@@ -330,7 +337,12 @@ class PageWorld:
             return None
         tick, snapshot = newest
         if snapshot.visuals is not self._visuals or not np.array_equal(snapshot.stumps, self._stumps):
-            self._follow_visuals(self._primitives, snapshot)
+            if not self._layout_lock.acquire(blocking=False):
+                return None
+            try:
+                self._follow_visuals(self._primitives, snapshot)
+            finally:
+                self._layout_lock.release()
         body = self._bodies(np.flatnonzero(self._moved_at > since))
         wire = np.flatnonzero(self._wire_moved_at > since)
         pose = np.concatenate([snapshot.body_q[body], self._wires.poses(wire, snapshot.wires)])

@@ -62,6 +62,7 @@ def create(
     hosts: Sequence[str] = (),
     days: float = CERTIFICATE_DAYS,
     authority: pathlib.Path | None = None,
+    permitted: Sequence[str] = (),
 ) -> list[pathlib.Path]:
     """Create the certificate of an actor and, at first use, the certificates of the authority and the server.
 
@@ -69,7 +70,8 @@ def create(
 
     ``hosts``: if ``name`` is ``server``, names and addresses under which clients reach the server, besides those of
     this machine. The server's certificate is then replaced. ``days``: validity [d]. ``authority``: folder of
-    ``ca.key``, by default ``folder`` with ``-authority`` appended.
+    ``ca.key``, by default ``folder`` with ``-authority`` appended. ``permitted``: names of hosts, addresses and
+    networks for which a new authority may sign (RFC 5280, name constraints); without them it may sign for every host.
 
     Raises :class:`CertificateError` if the actor already has a certificate, and
     :class:`vinesim.core.errors.UsageError` for an invalid name or role.
@@ -93,13 +95,25 @@ def create(
     try:
         for each in (authority, folder):
             each.mkdir(parents=True, exist_ok=True, mode=0o700)
-        written = _authority_of(folder, authority)
+        written = _authority_of(folder, authority, permitted)
         if name != SERVER and not (folder / f"{SERVER}.pem").exists():
             written += _signed(folder, authority, SERVER, Role.SERVER, (), days)
         return written + _signed(folder, authority, name, role, hosts, days)
     except OSError as error:
         place = error.filename or folder  # the error of a full disk names no file
         raise CertificateError(f"{place}: {error.strerror}: the certificate cannot be made there") from error
+
+
+def may_sign_only_for(folder: pathlib.Path, permitted: Sequence[str]) -> bool:
+    """Returns whether a folder has a certificate of an authority that may sign for ``permitted`` (as in
+    :func:`create`), and for nothing else."""
+    if _missing is not None:
+        raise CryptographyMissing from _missing
+    try:
+        found = _read(folder / f"{CA_NAME}.pem").extensions.get_extension_for_class(x509.NameConstraints)
+    except (CertificateError, x509.ExtensionNotFound):
+        return False
+    return found.critical and found.value == _constraints(permitted)
 
 
 def roles(folder: pathlib.Path) -> dict[str, Role]:
@@ -169,7 +183,7 @@ def expiring(folder: pathlib.Path) -> list[str]:
     return lines
 
 
-def _authority_of(folder: pathlib.Path, authority: pathlib.Path) -> list[pathlib.Path]:
+def _authority_of(folder: pathlib.Path, authority: pathlib.Path, permitted: Sequence[str]) -> list[pathlib.Path]:
     """Create the authority in the folder ``authority`` if there is none, and copy its certificate to ``folder``.
 
     Returns the paths of the files that were written.
@@ -181,14 +195,14 @@ def _authority_of(folder: pathlib.Path, authority: pathlib.Path) -> list[pathlib
         raise CertificateError(
             f"{public} is not of the authority in {authority}: give the folder of its {CA_NAME}.key with --authority"
         )
-    written = [] if has_key else _create_authority(authority)
+    written = [] if has_key else _create_authority(authority, permitted)
     if not public.exists():
         _write(public, _read(own).public_bytes(serialization.Encoding.PEM), 0o644)
         written.append(public)
     return written
 
 
-def _create_authority(folder: pathlib.Path) -> list[pathlib.Path]:
+def _create_authority(folder: pathlib.Path, permitted: Sequence[str]) -> list[pathlib.Path]:
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "vinesim authority")])
     usage = x509.KeyUsage(
@@ -202,14 +216,26 @@ def _create_authority(folder: pathlib.Path) -> list[pathlib.Path]:
         encipher_only=False,
         decipher_only=False,
     )
-    certificate = (
+    builder = (
         _builder(name, name, key.public_key(), 365 * AUTHORITY_YEARS)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(usage, critical=True)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
-        .sign(key, hashes.SHA256())
     )
-    return _save(folder, CA_NAME, key, certificate)
+    if permitted:
+        builder = builder.add_extension(_constraints(permitted), critical=True)
+    return _save(folder, CA_NAME, key, builder.sign(key, hashes.SHA256()))
+
+
+def _constraints(permitted: Sequence[str]) -> x509.NameConstraints:
+    """Returns the limits of an authority that may sign for names of hosts, addresses and networks only."""
+    subtrees: list[x509.GeneralName] = []
+    for one in permitted:
+        try:
+            subtrees.append(x509.IPAddress(ipaddress.ip_network(one)))
+        except ValueError:
+            subtrees.append(x509.DNSName(one))
+    return x509.NameConstraints(subtrees, None)
 
 
 def _signed(

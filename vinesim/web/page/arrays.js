@@ -31,3 +31,10 @@ export async function load(path) {
   if (!response.ok) throw Object.assign(new Error(`${path}: ${await response.text()}`), { status: response.status });
   return decode(await response.arrayBuffer());
 }
+
+/** Returns the address of the web socket at a path below the page's address, which holds the secret of the page. */
+export function socketAddress(path) {
+  const address = new URL(path, location);
+  address.protocol = address.protocol.replace("http", "ws");
+  return address.href;
+}

@@ -2,7 +2,7 @@
 
 import * as THREE from "./vendor/three.module.js";
 import { pointAt } from "./aim.js";
-import { decode, load } from "./arrays.js";
+import { decode, load, socketAddress } from "./arrays.js";
 import { FlyingEyes } from "./fly.js";
 import { Guide } from "./guide.js";
 import { ARM, Hand } from "./hand.js";
@@ -205,7 +205,7 @@ class Viewer {
   }
 
   connect() {
-    this.socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/state`);
+    this.socket = new WebSocket(socketAddress("state"));
     this.socket.binaryType = "arraybuffer";
     this.socket.onmessage = (event) => {
       ++page.states;

@@ -1,5 +1,7 @@
 // Sound of the page: its own socket, Opus by WebCodecs or PCM16, voices at the speakers' positions, tones of lights.
 
+import { socketAddress } from "./arrays.js";
+
 const RATE = 48000,
   FRAME = 960,
   PCM_FACTOR = 3; // Hz, samples, to 16 kHz
@@ -218,7 +220,7 @@ export class Voice {
   }
 
   connect() {
-    this.socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/voice`);
+    this.socket = new WebSocket(socketAddress("voice"));
     this.socket.binaryType = "arraybuffer";
     this.socket.onopen = () => this.socket.send(JSON.stringify({ opus: this.opus }));
     this.socket.onmessage = ({ data }) => (typeof data === "string" ? this.obey(JSON.parse(data)) : this.take(data));
