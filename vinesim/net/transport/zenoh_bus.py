@@ -446,6 +446,7 @@ class ZenohBus:
             replies = self._session.get(
                 self._prefix + key,
                 payload=payload,
+                source_info=self.source,
                 timeout=FETCH_TIMEOUT,
                 priority=zenoh.Priority.BACKGROUND,
                 consolidation=zenoh.ConsolidationMode.NONE,
