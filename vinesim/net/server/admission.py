@@ -23,6 +23,9 @@ GRACE_TIME = 10.0
 """Time after the start of a server in which liveliness tokens reserve names [s], because the actors that were there
 before join again. Afterwards only a join reserves a name."""
 
+SEVERAL = "several"
+"""Returned instead of a session if several sessions claim a name."""
+
 MAX_TOKENS = 20_000
 """Largest number of liveliness tokens that the server notes."""
 
@@ -121,6 +124,12 @@ class AdmissionControl:
     def has_actors(self, world: str) -> bool:
         """Whether any actor is live in a world."""
         return any(there == world for there, _ in self._alive) or any(there == world for there, _ in self._admitted)
+
+    def reserved_by(self, world: str, name: str, now: float) -> str:
+        """Returns the session that holds a name: the admitted one, else, until :attr:`reserved_until`, the live one
+        (:data:`SEVERAL` if there are several); empty if there is none. ``now`` [s]: time of the monotonic clock."""
+        live = self._alive.get((world, name), set()) if now < self.reserved_until else set()
+        return self.holder(world, name) or (SEVERAL if len(live) > 1 else "".join(live))
 
     def holder(self, world: str, name: str) -> str:
         """Returns the session that was admitted with a name; empty if there is none."""

@@ -547,7 +547,7 @@ class Server:
                 self._count_malformed(key[:200], MessageError("the query names no actor"))
                 return
             with self._lock:
-                holder = self._admission.holder(world, name)
+                holder = self._admission.reserved_by(world, name, time.monotonic())
             query.reply(str(query.key_expr), holder.encode())
 
     def _on_snapshot_query(self, query: zenoh.Query) -> None:
