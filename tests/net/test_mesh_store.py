@@ -154,7 +154,9 @@ def test_actors_that_fill_the_store_keep_no_other_from_it() -> None:
     assert "no room" in upload(store, ANNA, mesh(30, seed=91)).refused
     store = MeshStore(MeshLimits(total=100 * FACE_BYTES, per_actor=50 * FACE_BYTES))
     for number in range(100):
-        assert not store.offer(("w", f"n{number}"), MeshPart(digest_of(mesh(1, number)), 36, 0, mesh(1, number)), "a").refused
+        assert not store.offer(
+            ("w", f"n{number}"), MeshPart(digest_of(mesh(1, number)), 36, 0, mesh(1, number)), "a"
+        ).refused
     assert not upload(store, ANNA, mesh(40, seed=90)).refused
     assert download(store, digest_of(mesh(40, seed=90))) == mesh(40, seed=90)
 

@@ -68,7 +68,9 @@ class StrangerLoader(ThreadPoolExecutor):
                 process.kill()
                 self._running.discard(process)
         if process.returncode != 0:
-            why = f"it takes more than {cpu_time} s or too much memory" if process.returncode < 0 else _last_line(errors)
+            why = (
+                f"it takes more than {cpu_time} s or too much memory" if process.returncode < 0 else _last_line(errors)
+            )
             raise DescriptionError(f"its URDF was not loaded: {why}")
         result: RobotDescription | str = pickle.loads(found)
         if isinstance(result, str):

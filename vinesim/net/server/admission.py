@@ -223,9 +223,7 @@ class AdmissionControl:
             return self._admitted[actor].session == session and actor not in self._spectators
         return self._alive.get(actor) == {session}
 
-    def decide(
-        self, world: str, name: str, session: str, greeting: bytes, now: float, address: str = ""
-    ) -> Welcome:
+    def decide(self, world: str, name: str, session: str, greeting: bytes, now: float, address: str = "") -> Welcome:
         """Admit or reject an actor that sends the encoded hello ``greeting``, and return the reply to it.
 
         ``name``: name in the key of the query. ``now`` [s]: time of a monotonic clock. ``address``: from which the
@@ -261,7 +259,10 @@ class AdmissionControl:
                 return f"{what} {text[:60]!r}: use 1 to 48 letters, digits, '_', '-' or '.'"
         self.expire(now)
         limits = self.limits
-        for key, rate in (("session", session), limits.joins_per_session), (("address", address), limits.joins_per_address):
+        for key, rate in (
+            (("session", session), limits.joins_per_session),
+            (("address", address), limits.joins_per_address),
+        ):
             left, since = self._joins.get(key, (JOIN_BURST_TIME * rate, now))
             left = min(left + (now - since) * rate, JOIN_BURST_TIME * rate) - 1.0
             if key[1] and not is_loopback(key[1]) and left < 0.0:
@@ -269,9 +270,7 @@ class AdmissionControl:
             self._joins[key] = left, now
         return ""
 
-    def _find_objection(
-        self, world: str, name: str, session: str, hello: Hello, now: float, address: str
-    ) -> str:
+    def _find_objection(self, world: str, name: str, session: str, hello: Hello, now: float, address: str) -> str:
         """Returns the reason why an actor cannot be admitted, and the remedy; empty if it can."""
         if hello.name != name:
             return f"{name!r} introduces itself as {hello.name!r}"

@@ -136,7 +136,9 @@ def acl_config(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
         rule(
             "subscribe", "ingress", ["declare_subscriber", "liveliness_query", "declare_liveliness_subscriber"], world
         ),
-        rule("query", "ingress", ["query"], f"{root}/hello/*", f"{root}/holder/*", f"{root}/snap/*/*", f"{root}/mesh/*"),
+        rule(
+            "query", "ingress", ["query"], f"{root}/hello/*", f"{root}/holder/*", f"{root}/snap/*/*", f"{root}/mesh/*"
+        ),
         rule("be queried", "egress", ["query"], f"{root}/hello/*"),
         # without declarations of subscribers publishers would never match, and never send
         rule("see queryables", "egress", ["declare_queryable"], world),

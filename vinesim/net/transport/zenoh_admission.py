@@ -6,6 +6,7 @@ new server, and the hello is sent again.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import time
@@ -164,6 +165,14 @@ class ServerAdmission:
         self._declared.clear()
         self._patient_until = time.monotonic() + REJOIN_TIMEOUT
         self._watch_matches()
+
+    def close(self) -> None:
+        """Undeclare what was declared, because the session closes."""
+        querier, self._querier = self._querier, None
+        if querier is not None:
+            with contextlib.suppress(zenoh.ZError):
+                querier.undeclare()
+        self._declared.clear()
 
     def _watch_matches(self) -> None:
         querier = self._session.declare_querier(self._key)
