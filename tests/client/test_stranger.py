@@ -99,7 +99,7 @@ def test_a_process_loads_a_robot_as_this_process_does(loader):
     apart, here = loader.load(sent), stranger.load_sent(sent)
     assert (apart.drives, apart.urdf, apart.groups) == (here.drives, here.urdf, here.groups)
     np.testing.assert_array_equal(apart.fixed_poses, here.fixed_poses)
-    with pytest.raises(DescriptionError, match="two parents|loop"):
+    with pytest.raises(DescriptionError, match=r"two parents|loop"):
         loader.load(Hello("guest", urdf=chain(3).replace('parent link="l0"', 'parent link="l2"')))
 
 

@@ -226,14 +226,14 @@ def test_a_full_server_says_so_to_the_next_client_and_in_its_log(caplog):
         ZenohBus("ada", connect=server.endpoint).close()
 
 
-def test_the_number_of_sessions_follows_the_number_of_clients():
-    with Server("tcp/127.0.0.1:0", max_actors=1500) as server, ZenohBus("ada", connect=server.endpoint):
-        assert server.figures()["max_sessions"] == 3100
-        with contextlib.ExitStack() as stack, pytest.raises(JoinRejected, match="admits 1 actors"):
-            limited = stack.enter_context(Server("tcp/127.0.0.1:0", max_actors=1))
-            for name in ("bob", "carl"):
-                bus = stack.enter_context(ZenohBus(name, connect=limited.endpoint))
-                bus.join(encode_hello(Hello(name, digest="D")))
+def test_a_client_beyond_the_limit_of_actors_still_gets_a_session_and_is_told_the_limit():
+    with contextlib.ExitStack() as stack:
+        server = stack.enter_context(Server("tcp/127.0.0.1:0", max_actors=1))
+        assert server.figures()["max_sessions"] == 102
+        bob, carl = (stack.enter_context(ZenohBus(name, connect=server.endpoint)) for name in ("bob", "carl"))
+        bob.join(encode_hello(Hello("bob", digest="D")))
+        with pytest.raises(JoinRejected, match="admits 1 actors"):
+            carl.join(encode_hello(Hello("carl", digest="D")))
 
 
 def test_a_session_that_is_not_served_is_opened_anew_and_works_as_before(monkeypatch):
@@ -255,7 +255,7 @@ def test_a_session_that_is_not_served_is_opened_anew_and_works_as_before(monkeyp
         assert "is gone" in ada.status_message
         wait(lambda: ada.sessions_opened_anew == 1 and not ada.status_message, "a new session")
         assert ada.source.source_id.zid != before
-        assert ada.admissions == 2
+        assert ada.admissions >= 2
         heard: set = set()
 
         def all_heard() -> bool:

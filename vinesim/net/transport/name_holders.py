@@ -4,8 +4,8 @@ holds the name.
 A session holds a name once it has declared the liveliness token ``live/<name>/<session>``. If a second session declares
 a token of the same name, members that know the first token still accept the first session. A member that joins while
 both tokens exist accepts neither session until one token is gone. If the server knows which session joined with the
-name, that one holds it in both cases (:meth:`NameHolders.prefer`), so a token alone takes no name away. Messages that arrive after their session has left are
-accepted, because the last records of an actor may still be on their way.
+name, that one holds it in both cases (:meth:`NameHolders.prefer`), so a token alone takes no name away. Messages that
+arrive after their session has left are accepted, because the last records of an actor may still be on their way.
 
 Without TLS a session states its own identity. This separates programs that use vinesim or Zenoh as intended, but does
 not stop a program that was written to deceive (``docs/network.md``).

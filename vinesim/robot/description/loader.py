@@ -127,8 +127,8 @@ def load_description(
 
 
 def _read_remote(file: pathlib.Path) -> etree._Element:
-    """Returns the XML of a URDF that was received over the network. Its text was searched on arrival
-    (:func:`vinesim.scene.robot_limits.urdf_objection`); here its elements are counted again, as the parser sees them."""
+    """Returns the XML of a URDF that was received over the network. Its text was searched on arrival, by
+    :func:`vinesim.scene.robot_limits.urdf_objection`. Here its elements are counted as the parser sees them."""
     root = read_xml(file)
     if objection := counts_objection(collections.Counter(element.tag for element in root.iter(etree.Element))):
         raise description_error(file, objection, "give a smaller robot")
