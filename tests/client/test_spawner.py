@@ -225,7 +225,7 @@ def test_a_robot_name_from_the_network_opens_no_pipe_and_no_file_of_the_folder(v
     """``-`` means the standard input for ``--robot`` only, and ``other.urdf`` may be a file of the user."""
     (tmp_path / "other.urdf").write_text(vinebot.urdf)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("vinesim.client.remote.spawner.load_description", lambda file, **options: (file, options))
+    monkeypatch.setattr("vinesim.client.remote.stranger.load_description", lambda file, **options: (file, options))
     for name in ("-", "other.urdf"):
         file, options = resolve_description(hello(vinebot, urdf="<robot/>", robot=name), vinebot)
         assert options["is_remote"]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from vinesim.net.codec.control import Hello, Welcome, encode_hello, encode_welcome
 from vinesim.net.codec.header import PROTOCOL
-from vinesim.net.server.admission import PROVISIONAL_TIMEOUT, AdmissionControl, SceneId
+from vinesim.net.server.admission import PROVISIONAL_TIMEOUT, AdmissionControl, JoinLimits, SceneId
 from vinesim.net.transport import zenoh_admission
 
 
@@ -100,8 +100,75 @@ def test_an_admitted_actor_that_never_joins_loses_its_place():
     admission = AdmissionControl(max_actors=1)
     hello = encode_hello(Hello("ghost"))
     assert not admission.decide("w", "ghost", "g", hello, 0.0).refused
-    assert join(admission, "ada", now=1.0).refused
-    assert not join(admission, "ada", now=PROVISIONAL_TIMEOUT + 1.0).refused
+    eve = encode_hello(Hello("eve"))
+    assert "admits 1 actors" in admission.decide("w", "eve", "e", eve, 1.0).refused  # she has not come either
+    assert not admission.decide("w", "eve", "e", eve, PROVISIONAL_TIMEOUT + 1.0).refused
+    assert admission.expire(3.0 * PROVISIONAL_TIMEOUT) == [("w", "eve")]
+    assert not admission.decide("w", "ghost", "g", hello, 3.0 * PROVISIONAL_TIMEOUT).refused
+    assert not join(admission, "ada", now=3.0 * PROVISIONAL_TIMEOUT).refused  # an actor that is live does not wait
+    assert admission.holder("w", "ghost") == ""
+
+
+def test_join_queries_that_never_come_do_not_keep_an_honest_client_out():
+    admission = AdmissionControl(max_actors=12)
+    for number in range(12):
+        admission.decide("w", f"ghost{number}", "one session", encode_hello(Hello(f"ghost{number}")), 0.0)
+        admission.decide("w", f"ghost{number}", f"s{number}", encode_hello(Hello(f"ghost{number}")), 0.0)
+    assert not join(admission, "ada").refused
+
+
+def test_a_liveliness_token_alone_reserves_no_name_after_the_start():
+    admission = AdmissionControl()
+    admission.reserved_until = 10.0
+    admission.on_join("w", "ada", "squatter")
+    assert "already live" in join(admission, "ada", session="ada", now=9.0).refused
+    assert not join(admission, "ada", session="ada", now=11.0).refused
+    assert admission.holder("w", "ada") == "ada"
+    assert "already live" in join(admission, "ada", session="squatter", now=12.0).refused
+
+
+@pytest.mark.parametrize("world", ["w" * 260, "a\0b", "", "../x", "a b", "ü"])
+def test_a_world_that_clients_refuse_is_refused_by_the_server(world):
+    admission = AdmissionControl()
+    assert "use 1 to 48 letters" in join(admission, "ada", world=world).refused
+    assert "use 1 to 48 letters" in admission.decide("w", world, "s", encode_hello(Hello("ada")), 0.0).refused
+    assert "use 1 to 48 letters" in admission.decide("w", "ada", world, encode_hello(Hello("ada")), 0.0).refused
+    assert admission.scene_of(world) == SceneId()
+
+
+def test_worlds_joins_and_actors_of_one_address_are_limited():
+    limits = JoinLimits(actors_per_address=3, waiting_per_address=2, worlds=4, worlds_per_address=2)
+
+    def ask(name: str, world: str = "w", address: str = "10.0.0.7", live: bool = True, now: float = 0.0) -> str:
+        if live:
+            admission.on_join(world, name, name)
+        return admission.decide(world, name, name, encode_hello(Hello(name)), now, address).refused
+
+    admission = AdmissionControl(limits=limits)
+    assert [ask(name) for name in "abc"] == ["", "", ""]
+    assert "3 actors of one address" in ask("d")
+    assert ask("d", address="10.0.0.8") == ask("d", address="10.0.0.8") == ""
+    assert ask("e", address="127.0.0.1") == ask("f", address="127.0.0.1") == ""
+    assert ask("g", address="127.0.0.1") == ask("h", address="127.0.0.1") == ""  # this machine itself
+    assert ask("i", address="127.0.0.2", live=False) == ask("j", address="127.0.0.2", live=False) == ""
+    assert "did not come" in ask("k", address="127.0.0.2", live=False)
+    assert ask("l", "w2", "127.0.0.1") == ask("m", "w3", "127.0.0.1") == ""
+    assert "worlds" in ask("n", "w4", "127.0.0.1")
+    assert ask("o", "w3", "127.0.0.1") == ""  # a world that is there
+    assert ask("p", "w5", "10.0.0.9") == ""
+    assert "worlds" in ask("q", "w6", "10.0.0.10")
+    assert "more than 1 times a second" in [ask("a") for _ in range(20)][-1]
+    assert ask("a", now=60.0) == ""
+
+
+def test_what_a_session_holds_ends_with_it():
+    admission = AdmissionControl()
+    join(admission, "ada", session="s")
+    assert "has joined as 'ada'" in join(admission, "bob", session="s").refused
+    assert admission.end_session("s") == [("w", "ada")]
+    assert admission.end_session("s") == []
+    assert admission.scene_of("w") == SceneId()
+    assert not join(admission, "bob", session="s").refused
 
 
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.sampled_from(["D1", "D2"]), st.booleans()), max_size=40))

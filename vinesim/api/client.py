@@ -20,6 +20,7 @@ import numpy as np
 from vinesim.api.simulation import base_pose
 from vinesim.client.client import Client as RobotClient
 from vinesim.client.rate_loop import paced_loop
+from vinesim.client.remote.stranger import StrangerLoader
 from vinesim.client.tasks.free_places import choose_places
 from vinesim.client.tasks.start_poses import start_pose
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -89,7 +90,15 @@ class Client:
                 place = base_pose(pose, self.model.terrain)
             executor = stack.enter_context(ThreadPoolExecutor(1, "spawner"))
             self._client = RobotClient(
-                self.scene, self.model, described, bus, name=name, pose=place, executor=executor, device=device
+                self.scene,
+                self.model,
+                described,
+                bus,
+                name=name,
+                pose=place,
+                executor=executor,
+                loader=stack.enter_context(StrangerLoader()),
+                device=device,
             )
             stack.callback(self._client.leave)
             self._stack = stack.pop_all()

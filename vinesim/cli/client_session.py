@@ -19,6 +19,7 @@ from vinesim.cli.signals import stop_at_signals
 from vinesim.client.client import Client
 from vinesim.client.rate_loop import RateLoop, paced_loop
 from vinesim.client.recording.bunch_trace import Trace
+from vinesim.client.remote.stranger import StrangerLoader
 from vinesim.client.status import Status
 from vinesim.client.tasks.free_places import choose_places
 from vinesim.client.tasks.start_poses import with_start_pose
@@ -105,6 +106,7 @@ class ClientSession:
             "jitter_buffer": 1e-3 * options.jitter_buffer,
             "device": options.device,
             "executor": self.enter(ThreadPoolExecutor(1, "spawner")),
+            "loader": self.enter(StrangerLoader()),
         }
 
     def choose_places(self, bus: Bus, count: int = 1) -> list[int]:

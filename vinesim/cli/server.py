@@ -11,7 +11,8 @@ from vinesim.audio.hearing import SpectatorsSpeakTo
 from vinesim.cli.signals import stop_at_signals
 from vinesim.core.errors import UsageError
 from vinesim.net.pace import describe
-from vinesim.net.server.admission import SceneId
+from vinesim.net.server.admission import JoinLimits, SceneId
+from vinesim.net.server.journal import JournalError
 from vinesim.net.server.retained_store import Quota
 from vinesim.net.server.server import Server
 from vinesim.net.transport.endpoints import check_exposure, default_listen
@@ -28,6 +29,8 @@ def run(
     scene: str | None,
     seed: int | None,
     max_clients: int | None,
+    max_clients_per_address: int,
+    max_sessions: int | None,
     quota: tuple[float, float],
     tls: pathlib.Path | None,
     insecure: bool,
@@ -35,7 +38,7 @@ def run(
     spectators_speak_to: str = "people",
     real_time_factor: float | None = None,
 ) -> int:
-    """Carry messages until SIGINT or SIGTERM. Returns the exit code."""
+    """Carry messages until SIGINT or SIGTERM. Returns the exit code: 4 if records could not be written."""
     if status not in ("text", "json", "none"):
         raise UsageError(f"--status {status!r}: give text, json or none")
     if spectators_speak_to not in tuple(SpectatorsSpeakTo):
@@ -54,6 +57,8 @@ def run(
         state_folder=state_dir,
         scene=plan,
         max_actors=max_clients,
+        limits=JoinLimits(actors_per_address=max_clients_per_address),
+        max_sessions=max_sessions,
         quota=Quota(*quota),
         certificates=tls,
         spectators_speak_to=SpectatorsSpeakTo(spectators_speak_to),
@@ -67,7 +72,7 @@ def run(
                 print(json.dumps(figures) if status == "json" else _line(figures), flush=True)
         except BrokenPipeError:  # the reader of standard output has closed it: the run ends without an error
             pass
-    return 0
+    return JournalError.exit_code if server.unwritten else 0
 
 
 def _plan(scene: str, seed: int | None) -> SceneId:

@@ -31,6 +31,7 @@ from vinesim.client.remote.objects import ObjectSync
 from vinesim.client.remote.plant_couplings import PlantCouplings
 from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.client.remote.spawner import RemoteSpawner
+from vinesim.client.remote.stranger import StrangerLoader
 from vinesim.client.remote.tree_copies import TreeCopies
 from vinesim.client.signals import show_lights
 from vinesim.client.sound.exchange import SoundExchange
@@ -110,6 +111,7 @@ class Client:
         device: str = "cpu",
         clock: Callable[[], float] = time.monotonic,
         executor: Executor | None = None,
+        loader: StrangerLoader | None = None,
     ) -> None:
         """Create the simulation and the client's own actor.
 
@@ -120,6 +122,7 @@ class Client:
         ``source(time)`` returns the human's pose; without a source the human stands still. ``interest_radius`` [m]:
         actors nearer than this to an object receive its motion. ``jitter_buffer`` [s]: delay of remote actors.
         ``executor`` compiles the bodies of actors that join; without an executor the loop compiles them.
+        ``loader`` loads robots of strangers in processes.
         """
         self.name = name
         self.model = model
@@ -149,6 +152,7 @@ class Client:
         """Functions that make and apply the direct messages between actors, by kind of message."""
         self._description = description
         self._executor = executor
+        self._loader = loader
         self._outfit = outfit
         self._interest_radius = interest_radius
         self._jitter_buffer = jitter_buffer
@@ -197,7 +201,7 @@ class Client:
         self.clock = clock
         self.sound = SoundExchange(self)
         self.tree_copies = TreeCopies(self.physics, self.objects)
-        self.spawner = RemoteSpawner(self.physics.rigid, description, executor, self.meshes)
+        self.spawner = RemoteSpawner(self.physics.rigid, description, executor, self.meshes, loader)
 
     @property
     def is_alone(self) -> bool:
@@ -223,7 +227,7 @@ class Client:
         self.earlier_faults.update(before.faults | {"couplings_refused": self.couplings.refused})
         self.objects, self.couplings = ObjectSync(self.physics, self.replicators), PlantCouplings(self.physics)
         self.tree_copies = TreeCopies(self.physics, self.objects)
-        self.spawner = RemoteSpawner(self.physics.rigid, self._description, self._executor, self.meshes)
+        self.spawner = RemoteSpawner(self.physics.rigid, self._description, self._executor, self.meshes, self._loader)
         for name, pose in starts.items():
             self._add_robot_body(self.robots[name].description, name, pose)
         for name, (spec, source) in people.items():

@@ -38,6 +38,17 @@ def server(
     max_clients: Annotated[
         int | None, typer.Option(min=1, help="Largest number of actors at a time; by default unlimited.")
     ] = None,
+    max_clients_per_address: Annotated[
+        int, typer.Option(min=1, help="Largest number of actors of one address; this machine itself has no such limit.")
+    ] = 256,
+    max_sessions: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Largest number of network sessions; a client on another machine has two. By default 100 and two for "
+            "each of --max-clients, or 4096.",
+        ),
+    ] = None,
     quota: Annotated[
         tuple[float, float],
         typer.Option(help="MESSAGES/s and BYTES/s of retained records (cuts, resting objects) for each actor."),

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import concurrent.futures
 import dataclasses
+import functools
 import logging
-import tempfile
 from collections.abc import Callable, Mapping
-from pathlib import Path
 
 import numpy as np
 
 from vinesim.client.remote.mesh_exchange import MeshExchange
 from vinesim.client.remote.remote_human import RemoteHuman, human_spec
+from vinesim.client.remote.stranger import StrangerLoader, load_sent
 from vinesim.net.codec.control import Hello
 from vinesim.net.codec.header import is_valid_name
 from vinesim.rigid.mujoco_world import CompiledWorld
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.description.sidecar import decode_sidecar, encode_sidecar
+from vinesim.robot.description.sidecar import encode_sidecar
 from vinesim.robot.description.source import is_shipped
 from vinesim.robot.description.urdf import DescriptionError
 from vinesim.robot.drives.robot_instance import RemoteRobot
@@ -53,11 +53,13 @@ class RemoteSpawner:
         own: RobotDescription | None,
         executor: concurrent.futures.Executor | None = None,
         meshes: MeshExchange | None = None,
+        loader: StrangerLoader | None = None,
     ) -> None:
         """``own``: a description that is already loaded, if any. ``executor``: runs the compilation; None: the caller's
         thread does.
 
-        ``meshes``: exchange of meshes of remote robots; without it boxes replace their meshes.
+        ``meshes``: exchange of meshes of remote robots; without it boxes replace their meshes. ``loader``: loads
+        robots of strangers in processes; None: ``executor`` loads them itself.
         """
         self.meshes = meshes or MeshExchange()
         self._spawned: dict[str, Hello] = {}
@@ -68,6 +70,9 @@ class RemoteSpawner:
         self.rigid = rigid
         self.own = own
         self._executor = executor
+        self._loader = loader
+        self._loading: dict[str, tuple[Hello, concurrent.futures.Future[RobotDescription]]] = {}
+        """Robots of enqueued strangers that are being loaded, or are loaded, by name."""
         self._enqueued: dict[str, Hello] = {}
         self._leaving: dict[str, RemoteRobot | RemoteHuman] = {}
         """Copies of actors that have left, kept until the world without them is compiled."""
@@ -80,10 +85,15 @@ class RemoteSpawner:
     def enqueue(self, hello: Hello) -> None:
         """Add an actor that has joined. It is spawned at its first pose."""
         self._enqueued[hello.name] = hello
+        if self._loader is not None and hello.kind == "robot":
+            work = functools.partial(resolve_description, hello, self.own, load=self._loader.load)
+            self._loading[hello.name] = (hello, self._loader.submit(work))
 
     def cancel(self, name: str) -> None:
         """Remove an actor that has left."""
         self._enqueued.pop(name, None)
+        if (loading := self._loading.pop(name, None)) is not None:
+            loading[1].cancel()
         self._spawned.pop(name, None)
         self._outdated.discard(name)
 
@@ -109,7 +119,11 @@ class RemoteSpawner:
         All waiting actors are compiled together. An actor that cannot be compiled is logged and removed.
         """
         if self._compiling is None:
-            arrived = [(hello, updates[name]) for name, hello in self._enqueued.items() if name in updates]
+            arrived = [
+                (hello, updates[name])
+                for name, hello in self._enqueued.items()
+                if name in updates and (name not in self._loading or self._loading[name][1].done())
+            ]
             room_is_short = (
                 self._executor is not None and 2 * self.rigid.bunch_room < self.rigid.parameters.bunch_pool_size
             )
@@ -243,19 +257,27 @@ class RemoteSpawner:
         be loaded."""
         if isinstance(update, HumanUpdate):
             return None, human_spec(hello, update)
-        description = resolve_description(hello, self.own)
+        loading = self._loading.get(hello.name)
+        if loading is not None and loading[0] is hello:
+            description = loading[1].result()
+        else:
+            description = resolve_description(hello, self.own)
         if hello.joints not in (-1, len(description.drives)):
             raise DescriptionError(f"it announces {hello.joints} joints, its URDF drives {len(description.drives)}")
         return description, description.to_spec(hello.name, hello.index, update.base_q)
 
 
 def resolve_description(
-    hello: Hello, own: RobotDescription | None, received: Mapping[str, np.ndarray] | None = None
+    hello: Hello,
+    own: RobotDescription | None,
+    received: Mapping[str, np.ndarray] | None = None,
+    load: Callable[[Hello], RobotDescription] | None = None,
 ) -> RobotDescription:
     """Returns the description of another client's robot: an installed robot with equal URDF text and sidecar, or the
     sent URDF.
 
-    ``received``: corners [face, 3, 3] m of its meshes by digest; boxes replace missing meshes.
+    ``received``: corners [face, 3, 3] m of its meshes by digest; boxes replace missing meshes. ``load``: loads a
+    sent URDF; None: this thread does.
     """
 
     def is_same(known: RobotDescription) -> bool:
@@ -271,8 +293,4 @@ def resolve_description(
                 return known
     except DescriptionError:
         pass
-    sidecar = decode_sidecar(hello.sidecar)
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / f"{name}.urdf"
-        file.write_text(hello.urdf)
-        return load_description(file, is_remote=True, sidecar=sidecar, received=received)
+    return load_sent(hello, received) if load is None else load(hello)

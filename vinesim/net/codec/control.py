@@ -21,12 +21,12 @@ from vinesim.net.codec.header import (
 )
 from vinesim.net.codec.json_values import COUNT, NUMBER, POSE, TEXT, THING, YES, list_of, named, object_of, pose_value
 from vinesim.net.codec.objects import check_object_id
-from vinesim.net.codec.robot import MAX_JOINTS
 from vinesim.net.codec.trees import MAX_BODIES, MAX_TREES
 from vinesim.net.codec.wood import decode_wood
 from vinesim.net.pace import MIN_FACTOR, PaceReport
 from vinesim.net.replication.authority import Claim
 from vinesim.scene.ids import LABEL_STRIDE
+from vinesim.scene.robot_limits import MAX_JOINTS, urdf_objection
 
 CLAIMS = 3
 RETAINED = 4
@@ -183,8 +183,8 @@ def decode_hello(payload: bytes) -> Hello:
 
 
 def _check_hello(hello: Hello) -> None:
-    """Raise :class:`MessageError` unless the kind of actor exists, the outfit is a name, and each number is in its
-    range."""
+    """Raise :class:`MessageError` unless the kind of actor exists, the outfit is a name, each number is in its range,
+    and the URDF is within :mod:`vinesim.scene.robot_limits`."""
     if hello.kind not in ACTOR_KINDS:
         raise MessageError(f"greeting of {hello.name!r} with kind {hello.kind[:60]!r}, not {', '.join(ACTOR_KINDS)}")
     if hello.outfit and not is_valid_name(hello.outfit):
@@ -199,6 +199,8 @@ def _check_hello(hello: Hello) -> None:
     ):
         if not low <= value <= high:
             raise MessageError(f"greeting of {hello.name!r} with {what} {value}, not from {low} to {high}")
+    if objection := urdf_objection(hello.urdf):
+        raise MessageError(f"greeting of {hello.name!r}: {objection}")
 
 
 def encode_welcome(welcome: Welcome) -> bytes:

@@ -14,6 +14,7 @@ import numpy as np
 
 from vinesim.net.codec.header import HEADER, MessageError, pack_header, unpack_header
 from vinesim.net.codec.rotation import TURN_LSB, check_rotation_vectors, quaternion
+from vinesim.scene.robot_limits import MAX_JOINTS
 from vinesim.scene.values import LightPattern, Lights, RobotUpdate
 
 ROBOT = 1
@@ -28,9 +29,6 @@ JOINT_POSITION_LSB = 2e-4
 
 BASE_VELOCITY_LSB = 1e-3
 """Quantisation step of base velocities [m/s, rad/s]. Velocities are clipped at 32.7."""
-
-MAX_JOINTS = 256
-"""Largest number of joints of one robot."""
 
 _BASE = struct.Struct("<3f3h6hH4B")  # position, turn, velocity, scale of joint velocities, lights; then joints
 

@@ -2,12 +2,16 @@
 
 An actor offers a mesh part by part (:class:`vinesim.net.codec.meshes.MeshPart`). Each reply names the next missing
 part, so a lost message costs one repetition. A complete mesh is kept if it has the stated digest and can be decoded. A
-mesh that several actors offer is sent and kept once. It is kept while one of these actors is live, and afterwards until
-the store needs the memory.
+mesh that several actors offer is sent and kept once. It is kept while one of these actors is present, and afterwards
+until the store needs the memory.
+
+No actor can fill the store for others: if there is no room, an actor gets the room of the group (all actors of one
+address, or an actor of this machine) that holds most, as long as its own group then holds less than that one.
 """
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import logging
 import threading
@@ -54,8 +58,8 @@ class _Kept:
     """A complete mesh in the store."""
 
     payload: bytes
-    holders: set[Actor]
-    """Live actors that have offered the mesh."""
+    holders: dict[Actor, str]
+    """Present actors that have offered the mesh, and the group of each."""
 
 
 class MeshStore:
@@ -66,8 +70,9 @@ class MeshStore:
         self.counters = MeshCounters()
         self._kept: dict[str, _Kept] = {}
         """Complete meshes by digest, in the order of their last request or offer."""
-        self._incomplete: dict[Actor, tuple[MeshPart, bytearray]] = {}
-        """Incomplete mesh that each actor is sending: its first part without data, and all bytes that have arrived."""
+        self._incomplete: dict[Actor, tuple[MeshPart, bytearray, str]] = {}
+        """Incomplete mesh that each actor is sending: its first part without data, all bytes that have arrived, and the
+        group of the actor."""
         self._bytes = 0
         """Size of all meshes in :attr:`_kept` [B]."""
         self._lock = threading.Lock()
@@ -94,38 +99,39 @@ class MeshStore:
         offset = min(offset, size)
         return MeshPart(digest, size, offset, kept.payload[offset : offset + MAX_PART])
 
-    def offer(self, actor: Actor, part: MeshPart) -> MeshWanted:
+    def offer(self, actor: Actor, part: MeshPart, group: str = "") -> MeshWanted:
         """Store a part of a mesh that an actor offers. Returns the reply, which names the part that the actor shall
-        send next."""
+        send next. ``group``: of which the actor is a part when room is short; empty: the actor alone."""
+        group = group or "/".join(actor)
         with self._lock:
             kept = self._kept.get(part.digest)
             if kept is not None:
-                if refused := "" if actor in kept.holders else self._objection(actor, len(kept.payload), 0):
+                if refused := "" if actor in kept.holders else self._objection(actor, group, len(kept.payload), 0):
                     return self._refuse(actor, refused)
                 self._incomplete.pop(actor, None)
-                kept.holders.add(actor)
+                kept.holders[actor] = group
                 return MeshWanted(len(kept.payload))
-            begun, arrived = self._incomplete.get(actor, (None, bytearray()))
+            begun, arrived, _ = self._incomplete.get(actor, (None, bytearray(), ""))
             if begun is None or (begun.digest, begun.size) != (part.digest, part.size):
                 self._incomplete.pop(actor, None)
-                if refused := self._objection(actor, part.size, part.size):
+                if refused := self._objection(actor, group, part.size, part.size):
                     return self._refuse(actor, refused)
-                begun, arrived = self._incomplete[actor] = MeshPart(part.digest, part.size), bytearray()
+                begun, arrived, _ = self._incomplete[actor] = MeshPart(part.digest, part.size), bytearray(), group
             if part.offset == len(arrived):
                 arrived += part.data
             if len(arrived) < part.size:
                 return MeshWanted(len(arrived))
             del self._incomplete[actor]
-        return self._complete(actor, part, bytes(arrived))
+        return self._complete(actor, group, part, bytes(arrived))
 
     def release(self, actor: Actor) -> None:
         """Note that an actor has left. Meshes that no other live actor offered may then be removed to make room."""
         with self._lock:
             self._incomplete.pop(actor, None)
             for kept in self._kept.values():
-                kept.holders.discard(actor)
+                kept.holders.pop(actor, None)
 
-    def _complete(self, actor: Actor, part: MeshPart, payload: bytes) -> MeshWanted:
+    def _complete(self, actor: Actor, group: str, part: MeshPart, payload: bytes) -> MeshWanted:
         """Keep a mesh that has arrived completely, if it has the stated digest and can be decoded. Returns the
         reply."""
         try:  # without the lock: decoding a large mesh takes milliseconds
@@ -137,21 +143,22 @@ class MeshStore:
             return self._refuse(actor, f"mesh {part.digest[:8]} is corrupt: {error}", is_limit=False)
         with self._lock:
             if part.digest not in self._kept:
-                if refused := self._objection(actor, len(payload), len(payload)):
+                if refused := self._objection(actor, group, len(payload), len(payload)):
                     return self._refuse(actor, refused)
-                self._kept[part.digest] = _Kept(payload, set())
+                self._kept[part.digest] = _Kept(payload, {})
                 self._bytes += len(payload)
                 self.counters.kept += 1
-            self._kept[part.digest].holders.add(actor)
+            self._kept[part.digest].holders[actor] = group
         return MeshWanted(len(payload))
 
     def _used(self) -> int:
-        return self._bytes + sum(begun.size for begun, _ in self._incomplete.values())
+        return self._bytes + sum(begun.size for begun, _, _ in self._incomplete.values())
 
-    def _objection(self, actor: Actor, size: int, room: int) -> str:
+    def _objection(self, actor: Actor, group: str, size: int, room: int) -> str:
         """Returns the reason why an actor may not offer a mesh of ``size`` [B]; empty if it may.
 
-        Removes meshes of actors that have left if fewer than ``room`` [B] are free.
+        If fewer than ``room`` [B] are free, removes meshes of actors that have left, then those of the group that holds
+        most.
         """
         limits = self.limits
         own = [len(kept.payload) for kept in self._kept.values() if actor in kept.holders]
@@ -162,9 +169,33 @@ class MeshStore:
         unused = [digest for digest, kept in self._kept.items() if not kept.holders]
         while room and (len(self._kept) >= limits.count or self._used() + room > limits.total):
             if not unused:
+                if self._take_from_largest(group, room):
+                    continue
                 return f"the server keeps {len(self._kept)} meshes, {self._used() >> 20} MiB, and has no room"
             self._bytes -= len(self._kept.pop(unused.pop(0)).payload)
         return ""
+
+    def _take_from_largest(self, group: str, room: int) -> bool:
+        """Remove one mesh of the group that holds most. Returns whether that was done: not if ``group`` would hold more
+        than that group with further ``room`` [B]."""
+        held: collections.Counter[str] = collections.Counter()
+        for kept in self._kept.values():
+            for one in set(kept.holders.values()):
+                held[one] += len(kept.payload)
+        for begun, _, one in self._incomplete.values():
+            held[one] += begun.size
+        largest, most = max(held.items(), key=lambda item: item[1], default=(group, 0))
+        if held[group] + room >= most:
+            return False
+        for actor, (_, _, one) in self._incomplete.items():
+            if one == largest:
+                del self._incomplete[actor]
+                return True
+        for digest, kept in self._kept.items():
+            if set(kept.holders.values()) == {largest}:
+                self._bytes -= len(self._kept.pop(digest).payload)
+                return True
+        return False
 
     def _refuse(self, actor: Actor, reason: str, *, is_limit: bool = True) -> MeshWanted:
         """Count a refused offer, log the first one, and return the reply that refuses it."""

@@ -43,6 +43,13 @@ MAX_QUEUED_BYTES = 64 << 20
 """Largest size of all messages in the store's queue [B]."""
 
 
+MAX_BUCKETS = 256
+"""Number of actors with a quota from which on the quotas of idle ones are removed."""
+
+MAX_WARNED = 1000
+"""Largest number of actors whose first problem is logged."""
+
+
 class Quota(NamedTuple):
     """Sustained rate at which one actor may publish records. The records of :data:`BURST_TIME` may arrive at once."""
 
@@ -85,6 +92,10 @@ class _TokenBucket:
         self._quota = quota
         self._updated_at = now
         self._tokens = [BURST_TIME * rate for rate in quota]
+
+    def is_idle(self, now: float) -> bool:
+        """Whether nothing was spent for so long that all tokens are there again."""
+        return now - self._updated_at > BURST_TIME
 
     def spend(self, size: int, now: float) -> bool:
         """Take the tokens for a message of ``size`` [B]. Returns False, and takes none, if there are too few."""
@@ -143,11 +154,28 @@ class RetainedStore:
         self._lock = threading.Lock()
         self._wakeup = threading.Event()
         self._closing = False
-        self.status_message = ""
-        """Reason why the journals cannot be written now; empty if they can. Records stay in memory until they can be
-        written."""
+        self._troubles: dict[str, str] = {}
+        """Reason why the journal of a world cannot be written now, by world. Its records stay in memory until it can
+        be. Other worlds are written."""
+        self._ended = ""
+        """Error that ended the store's thread; empty while it runs."""
         self._thread = threading.Thread(target=self._run, name="retained store", daemon=True)
         self._thread.start()
+
+    @property
+    def status_message(self) -> str:
+        """Reason why records cannot be written now; empty if they can. Names one world, and the number of others."""
+        troubles = list(self._troubles.items())
+        if self._ended or not troubles:
+            return self._ended
+        more = f" (and {len(troubles) - 1} more worlds)" if len(troubles) > 1 else ""
+        return f"world {troubles[0][0]!r}{more}: {troubles[0][1]}"
+
+    @property
+    def unwritten(self) -> list[str]:
+        """Returns the worlds with records that are not on the disk, sorted. After :meth:`close` they are lost."""
+        with self._lock:
+            return sorted(self._states if self._ended and self._folder is not None else self._troubles)
 
     def scene_of(self, world: str) -> SceneId | None:
         """Returns the scene of a world that has retained records; None for any other world."""
@@ -158,6 +186,18 @@ class RetainedStore:
         """Number of objects with a retained record, in all worlds together."""
         with self._lock:
             return sum(len(records) for records in self._states.values())
+
+    def all_worlds(self) -> list[str]:
+        """Returns the worlds that were opened or have records."""
+        with self._lock:
+            return list(self._states)
+
+    def forget(self, world: str) -> None:
+        """Forget a world without records, because its last actor has left."""
+        with self._lock:
+            if world in self._states and not self._states[world] and world not in self._journals:
+                del self._states[world]
+                self._scenes.pop(world, None)
 
     def open(self, world: str, scene: SceneId) -> None:
         """Retain the records of a world, because an actor was admitted to it. ``scene``: the scene of the world."""
@@ -207,19 +247,19 @@ class RetainedStore:
     # ------------------------------------------------------------ the store's own thread
 
     def _run(self) -> None:
-        """Body of the store's thread. If an error ends the thread, :attr:`status_message` contains the error."""
+        """Body of the store's thread. If an error ends the thread, :attr:`status_message` has the error."""
         try:
             self._keep_records()
         except Exception as error:
             log.exception("the thread that keeps records has ended")
-            self.status_message = f"the thread that keeps records has ended, restart the server: {error!r}"
+            self._ended = f"the thread that keeps records has ended, restart the server: {error!r}"
 
     def _keep_records(self) -> None:
         """Process the queue and force records to the disk until the store is closed."""
-        synced_at = time.monotonic()
+        synced_at = retried_at = time.monotonic()
         unsynced: set[str] = set()
         while True:
-            self._wakeup.wait(SYNC_PERIOD if unsynced else RETRY_PERIOD if self.status_message else None)
+            self._wakeup.wait(SYNC_PERIOD if unsynced else RETRY_PERIOD if self._troubles else None)
             self._wakeup.clear()
             closing = self._closing
             while self._queue:
@@ -228,35 +268,31 @@ class RetainedStore:
                 if time.monotonic() - synced_at >= SYNC_PERIOD:
                     break
             now = time.monotonic()
-            if self.status_message and now - synced_at >= RETRY_PERIOD:
+            if self._troubles and (closing or now - retried_at >= RETRY_PERIOD):
                 self._recover()
-                synced_at = now
-            elif now - synced_at >= SYNC_PERIOD and not self.status_message:
-                self._try_write(lambda: [self._journals[world].sync() for world in sorted(unsynced)])
+                retried_at = now
+            if now - synced_at >= SYNC_PERIOD:
+                for world in sorted(unsynced - self._troubles.keys()):
+                    self._try_write(world, self._journals[world].sync)
                 unsynced.clear()
                 synced_at = now
             if self._queue:
                 self._wakeup.set()
             elif closing:
                 break
-        for journal in self._journals.values():
-            self._try_write(journal.close)
+        for world, journal in self._journals.items():
+            self._try_write(world, journal.close)
+        for world in self.unwritten:
+            log.error("the records of world %r are lost, because they could not be written", world)
 
     def _recover(self) -> None:
-        """Try to write all journals again after a disk error."""
-        error = self.status_message
-        for world, records in list(self._states.items()):
-            if (journal := self._journals.get(world)) is not None:
-                write = journal.rewrite
-            elif len(records):
-                write = functools.partial(self._open_journal, world)
-            else:
-                continue
-            if not self._try_write(write):
-                return
-        if self.status_message == error:
-            self.status_message = ""
-            log.warning("records are written again")
+        """Try to write the journals again that could not be written."""
+        for world in list(self._troubles):
+            journal = self._journals.get(world)
+            write = journal.rewrite if journal is not None else functools.partial(self._open_journal, world)
+            if self._try_write(world, write):
+                del self._troubles[world]
+                log.warning("records of world %r are written again", world)
 
     def _ingest_guarded(self, key: str, payload: bytes) -> str:
         """Call :meth:`_ingest` with a message. If this raises an unexpected error, drop the message and count the
@@ -296,8 +332,8 @@ class RetainedStore:
                     self.counters.rejected += 1
                 return ""
         now = time.monotonic()
-        if len(self._buckets) >= MAX_QUEUED:
-            self._buckets.clear()  # somebody floods the server with names: start all quotas again
+        if len(self._buckets) >= MAX_BUCKETS:  # one that was idle for this long is as full as a new one
+            self._buckets = {one: kept for one, kept in self._buckets.items() if not kept.is_idle(now)}
         bucket = self._buckets.setdefault((world, actor), _TokenBucket(self._quota, now))
         if not bucket.spend(len(payload), now):
             self.counters.over_quota += 1
@@ -321,20 +357,20 @@ class RetainedStore:
 
     def _merge(self, world: str, cell: Cell, record: RetainedRecord) -> bool:
         """Merge a record and append it to the journal of its world. Returns whether a journal has changed."""
-        records = self._states[world]
         with self._lock:
-            if not records.merge(cell, record):
+            records = self._states.get(world)
+            if records is None or not records.merge(cell, record):
                 return False
         if self._folder is None:
             return False
         # without the lock, so that snapshots do not wait for the disk
         journal = self._journals.get(world)
-        if self.status_message:
+        if world in self._troubles:
             pass  # _recover writes it with everything else
         elif journal is not None:
-            self._try_write(lambda: journal.append(cell, record))
+            self._try_write(world, lambda: journal.append(cell, record))
         else:
-            self._try_write(lambda: self._open_journal(world))
+            self._try_write(world, lambda: self._open_journal(world))
         return world in self._journals
 
     def _open_journal(self, world: str) -> None:
@@ -343,15 +379,16 @@ class RetainedStore:
         path = self._folder / f"{world}{SUFFIX}"
         self._journals[world] = Journal(path, world, self._scenes[world], self._states[world])
 
-    def _try_write(self, write: Callable[[], object]) -> bool:
-        """Call ``write``, which writes a journal. Returns whether it succeeded; if not, set :attr:`status_message`."""
+    def _try_write(self, world: str, write: Callable[[], object]) -> bool:
+        """Call ``write``, which writes the journal of a world. Returns whether it succeeded. Any error is trouble of
+        this world only."""
         try:
             write()
             return True
-        except JournalError as error:
-            if not self.status_message:
-                log.error("records are kept in memory only until this is repaired: %s", error)
-            self.status_message = str(error)
+        except (JournalError, OSError, ValueError) as error:
+            if world not in self._troubles:
+                log.error("records of world %r are kept in memory only until this is repaired: %s", world, error)
+            self._troubles[world] = str(error)
             return False
 
     def _count_malformed(self, world: str, actor: str, reason: str) -> None:
@@ -360,7 +397,7 @@ class RetainedStore:
 
     def _warn_once(self, world: str, actor: str, what: str) -> None:
         """Log a problem with the messages of an actor, but only the first one of each actor."""
-        if (world, actor) not in self._warned and len(self._warned) < MAX_QUEUED:
+        if (world, actor) not in self._warned and len(self._warned) < MAX_WARNED:
             self._warned.add((world, actor))
             log.warning("%s/%s %s (logged once)", world, actor, what)
 

@@ -24,10 +24,11 @@ from vinesim.net.codec.header import MAX_MESSAGE, MessageError, is_valid_name
 from vinesim.net.codec.meshes import decode_part, decode_request, encode_part, encode_wanted
 from vinesim.net.pace import MIN_FACTOR, WorldClock
 from vinesim.net.replication.interest import Cell
-from vinesim.net.server.admission import AdmissionControl, SceneId
+from vinesim.net.server.admission import GRACE_TIME, AdmissionControl, JoinLimits, SceneId, is_loopback
 from vinesim.net.server.main_server_watch import WATCH_PERIOD, MainServerWatch
 from vinesim.net.server.mesh_store import MeshStore
 from vinesim.net.server.retained_store import Quota, RetainedStore
+from vinesim.net.server.sessions import SessionTable, max_sessions_for, raise_file_limit
 from vinesim.net.transport import endpoints
 from vinesim.net.transport.access_control import SERVER, acl_config, server_answers_config, tls_config
 from vinesim.net.transport.bus import BusError
@@ -58,6 +59,15 @@ not report to it which of their clients are live: observed in 5 to 15 % of resta
 MAX_EMPTY_WORLDS = 64
 """Largest number of worlds without actors whose clocks are kept."""
 
+MAX_WARNED = 1000
+"""Largest number of keys whose first problem is logged."""
+
+TIDY_PERIOD = 1.0
+"""Time between two looks for actors and worlds that are gone [s]."""
+
+EMPTY_WORLD_TIME = 60.0
+"""Time after which a world without actors and records is forgotten [s]. Until then its last records may arrive."""
+
 
 class PortTaken(BusError):
     """The server cannot listen on an endpoint."""
@@ -86,6 +96,8 @@ class Server:
         certificates: pathlib.Path | None = None,
         world: str = WORLD,
         real_time_factor: float | None = None,
+        limits: JoinLimits = JoinLimits(),
+        max_sessions: int | None = None,
     ) -> None:
         """Listen on endpoints like ``tcp/0.0.0.0:7377``. Port 0 chooses a free port, see :attr:`endpoint`.
 
@@ -99,7 +111,9 @@ class Server:
         ``certificates``: folder of the server's certificates (:mod:`vinesim.net.transport.certificates`), which is read
         again when its files change. With it, ``world`` is the only world, and every actor needs a certificate.
         ``real_time_factor``: fixed real-time factor of all worlds; None: each world is as fast as its clients can
-        follow, at most 1.
+        follow, at most 1. ``limits``: limits for joins; ``max_actors`` replaces one of them. ``max_sessions``: largest
+        number of Zenoh sessions, of which a client on another machine opens two; None: as many as ``max_actors`` need,
+        see :func:`vinesim.net.server.sessions.max_sessions_for`.
 
         Raises :class:`PortTaken`, :class:`vinesim.core.errors.UsageError` for an invalid endpoint or combination,
         :class:`vinesim.net.server.journal.JournalError` and
@@ -138,7 +152,13 @@ class Server:
         self.foreign = 0
         """Number of messages with records that a session sent under the name of another session."""
         self._malformed = 0
-        self._admission = AdmissionControl(scene, max_actors, spectators_speak_to)
+        self._admission = AdmissionControl(scene, max_actors, spectators_speak_to, limits)
+        self._admission.reserved_until = time.monotonic() + GRACE_TIME
+        self._max_sessions = max_sessions_for(max_actors) if max_sessions is None else max_sessions
+        raise_file_limit(self._max_sessions)
+        self._sessions = SessionTable(self._max_sessions)
+        self._empty_since: dict[str, float] = {}
+        """Time since when a world of the store has no actors [s], by world."""
         self._lock = threading.Lock()
         self._session_lock = threading.Lock()
         """Held while the router is closed and opened again."""
@@ -149,7 +169,7 @@ class Server:
         self.meshes = MeshStore()
         """Meshes of robots, for clients that do not have the files."""
         try:
-            self._session = _open_router(self.endpoints, linked, settings)
+            self._session = _open_router(self.endpoints, linked, settings, self._max_sessions)
         except PortTaken:
             if self.store is not None:
                 self.store.close()
@@ -181,19 +201,25 @@ class Server:
         Returns the declared entities.
         """
         session = self._session
+        self._sessions.clear()
         declared: list[object] = [
             session.liveliness().declare_subscriber(f"{root}/live/*/*", self._on_liveliness, history=True)
         ]
         if self.store is not None:
             declared += [  # join first, because actors that reconnect join before they publish
                 session.declare_queryable(f"{root}/join/*/*", self._on_join_query),
+                session.declare_queryable(f"{root}/holder/*", self._on_holder_query),
                 session.declare_queryable(f"{root}/clock/*", self._on_clock_query),
                 session.declare_queryable(f"{root}/snap/*/*", self._on_snapshot_query),
                 session.declare_subscriber(f"{root}/fact/**", self._on_record),
                 session.declare_queryable(f"{root}/offer/*", self._on_mesh_offer),
                 session.declare_queryable(f"{root}/mesh/*", self._on_mesh_query),
             ]
-        declared.append(session.declare_queryable(f"{root}/server/*", _on_server_query))
+        declared += [
+            session.info.declare_link_events_listener(self._on_link, history=True),
+            session.info.declare_transport_events_listener(self._on_transport),
+            session.declare_queryable(f"{root}/server/*", _on_server_query),
+        ]
         return declared
 
     @property
@@ -227,7 +253,7 @@ class Server:
         now = time.monotonic()
         (real, begin) = self._start
         clock = WorldClock(now, begin + (now - real) * (self._fixed_factor or 1.0), self._fixed_factor)
-        if self._admission.has_actors(world):
+        if self._admission.has_actors(world) and len(self._clocks) < self._admission.limits.worlds:
             for name in [name for name in self._clocks if not self._admission.has_actors(name)][:-MAX_EMPTY_WORLDS]:
                 del self._clocks[name]
             self._clocks[world] = clock
@@ -240,12 +266,45 @@ class Server:
             return self._clock(WORLD).time(time.monotonic())
 
     def _run_clocks(self) -> None:
-        """Body of the thread that advances the clocks of all worlds and so adapts their real-time factors."""
+        """Body of the thread that advances the clocks of all worlds and so adapts their real-time factors, and tidies
+        up."""
+        tidied_at = time.monotonic()
         while not self._stop.wait(pace.STEP):
             now = time.monotonic()
+            if now - tidied_at >= TIDY_PERIOD:
+                tidied_at = now
+                try:
+                    self._tidy(now)
+                except Exception:  # go on: this thread has the clocks
+                    log.exception("an error while the server tidied up")
             with self._lock:
                 for clock in self._clocks.values():
                     clock.advance(now)
+
+    def _tidy(self, now: float) -> None:
+        """Release what actors hold that were admitted and did not come, and forget worlds that nobody needs."""
+        with self._lock:
+            gone = self._admission.expire(now)
+            worlds = [] if self.store is None else self.store.all_worlds()
+            empty = {world for world in worlds if not self._admission.has_actors(world)}
+        self._release(gone)
+        self._empty_since = {world: self._empty_since.get(world, now) for world in empty}
+        for world, since in self._empty_since.items():
+            if self.store is None or now - since < EMPTY_WORLD_TIME:
+                continue
+            if (kept := self.store.scene_of(world)) is not None:
+                with self._lock:
+                    self._admission.pin_scene(world, kept)
+            else:
+                self.store.forget(world)
+
+    def _release(self, actors: Sequence[tuple[str, str]]) -> None:
+        """Release what actors hold that are gone."""
+        for world, name in actors:
+            self.meshes.release((world, name))
+            with self._lock:
+                if world in self._clocks:
+                    self._clocks[world].forget(name)
 
     def _watch_main_server(self) -> None:
         """Body of the thread that looks for the server to which this one is linked."""
@@ -260,6 +319,8 @@ class Server:
             "endpoints": [str(endpoint) for endpoint in self.endpoints],
             "actors": self.actors,
             "links": self._link_count(),
+            "sessions": len(self._sessions),
+            "max_sessions": self._max_sessions,
             "joined": self.joined,
             "refused": self._admission.refused,
             "pings": self.pings,
@@ -308,12 +369,17 @@ class Server:
         self._stop.set()
 
     def close(self) -> None:
-        """Close the router and the store. Idempotent."""
+        """Close the router and the store. Idempotent. :attr:`unwritten` then has the worlds whose records are lost."""
         self.stop()
         with self._session_lock:
             close_session(self._session)
         if self.store is not None:
             self.store.close()
+
+    @property
+    def unwritten(self) -> list[str]:
+        """Returns the worlds with records that are not on the disk, sorted."""
+        return [] if self.store is None else self.store.unwritten
 
     def __enter__(self) -> Self:
         return self
@@ -357,14 +423,16 @@ class Server:
                 return
             close_session(self._session)
             with self._lock:
-                self._admission.forget_actors()
+                gone = self._admission.forget_actors()
+                self._admission.reserved_until = time.monotonic() + GRACE_TIME
+            self._release(gone)
             # a session that fails to open may keep some sockets, so wait until all of them are free
             until = time.monotonic() + RELEASE_TIMEOUT
             self._stop.wait(REOPEN_DELAY)
             while time.monotonic() < until and not all(map(endpoints.can_listen, self.endpoints)):
                 self._stop.wait(0.02)
             try:
-                self._session = _open_router(self.endpoints, self._linked, settings)
+                self._session = _open_router(self.endpoints, self._linked, settings, self._max_sessions)
                 self._declared = self._declare(self._root)
             except BusError as error:
                 log.error("no client can connect until the server listens again; it goes on trying: %s", error)
@@ -373,8 +441,24 @@ class Server:
 
     # ------------------------------------------------------------ called by Zenoh's threads
 
+    def _on_link(self, event: zenoh.LinkEvent) -> None:
+        if event.kind == zenoh.SampleKind.PUT:
+            self._sessions.add(str(event.link.zid), str(event.link.dst))
+
+    def _on_transport(self, event: zenoh.TransportEvent) -> None:
+        if event.kind == zenoh.SampleKind.PUT:
+            return
+        session = str(event.transport.zid)
+        self._sessions.remove(session)
+        with self._lock:
+            gone = self._admission.end_session(session)
+        self._release(gone)
+
     def _on_liveliness(self, sample: zenoh.Sample) -> None:
         world, _, name, session = str(sample.key_expr).split("/")[-4:]
+        if not all(map(is_valid_name, (world, name, session))):
+            self._count_malformed(_strip_root(sample.key_expr)[:200], MessageError("a token of no valid actor"))
+            return
         is_live = sample.kind == zenoh.SampleKind.PUT
         with self._lock:
             (self._admission.on_join if is_live else self._admission.on_leave)(world, name, session)
@@ -391,6 +475,9 @@ class Server:
         key = _strip_root(sample.key_expr)
         source = sample.source_info
         world, _, rest = key.partition("/")
+        if not is_valid_name(world):
+            self._count_malformed(key[:200], MessageError("the record belongs to no valid world"))
+            return
         with self._lock:
             is_own = source is not None and self._admission.may_publish(
                 world, rest.rpartition("/")[2], str(source.source_id.zid)
@@ -407,7 +494,7 @@ class Server:
             key = _strip_root(query.key_expr)
             world, _, name = key.split("/") if key.count("/") == 2 else ("*", "", "")
             try:
-                if "*" in key or not is_valid_name(name):
+                if not is_valid_name(world) or not is_valid_name(name):
                     raise MessageError("the query names no world, or no valid actor")
                 question = decode_time(_query_payload(query))
             except MessageError as error:
@@ -434,12 +521,34 @@ class Server:
             with self._lock:
                 if (kept := self.store.scene_of(world)) is not None:
                     self._admission.pin_scene(world, kept)
-                welcome = self._admission.decide(world, name, session, _query_payload(query), time.monotonic())
+                welcome = self._admission.decide(
+                    world, name, session, _query_payload(query), time.monotonic(), self._address(session)
+                )
                 if not welcome.refused:
                     self.store.open(world, self._admission.scene_of(world))
             if welcome.refused:
-                log.warning("refused %s/%s: %s", world, name, welcome.refused)
+                self._warn_once(key[:200], f"refused: {welcome.refused}")
             query.reply(str(query.key_expr), encode_welcome(welcome))
+
+    def _address(self, session: str) -> str:
+        """Returns the address of a session; empty if it is connected to another server."""
+        if address := self._sessions.address(session):
+            return address
+        for link in self._session.info.links():  # its event may be on its way
+            if str(link.zid) == session:
+                self._sessions.add(session, str(link.dst))
+        return self._sessions.address(session)
+
+    def _on_holder_query(self, query: zenoh.Query) -> None:
+        with query:
+            key = _strip_root(query.key_expr)
+            world, _, name = key.split("/") if key.count("/") == 2 else ("*", "", "")
+            if not is_valid_name(world) or not is_valid_name(name):
+                self._count_malformed(key[:200], MessageError("the query names no actor"))
+                return
+            with self._lock:
+                holder = self._admission.reserved_by(world, name, time.monotonic())
+            query.reply(str(query.key_expr), holder.encode())
 
     def _on_snapshot_query(self, query: zenoh.Query) -> None:
         with query:
@@ -473,9 +582,13 @@ class Server:
                 if "*" in key:
                     raise MessageError("an actor can only offer its own meshes")
                 with self._lock:
-                    if not self._admission.is_admitted(world, name):
-                        raise MessageError("only an actor that has joined can offer meshes")
-                wanted = self.meshes.offer((world, name), decode_part(_query_payload(query)))
+                    holder = self._admission.holder(world, name)
+                    address = self._admission.address(world, name)
+                source = query.source_info
+                if not holder or source is None or str(source.source_id.zid) != holder:
+                    raise MessageError("only an actor that has joined can offer meshes")
+                group = address if address and not is_loopback(address) else f"{world}/{name}"
+                wanted = self.meshes.offer((world, name), decode_part(_query_payload(query)), group)
             except MessageError as error:
                 self._count_malformed(key, error)
                 return
@@ -501,13 +614,16 @@ class Server:
 
     def _warn_once(self, key: str, reason: str) -> None:
         """Log a problem with what arrived under a key, but only the first one for each key."""
-        if key not in self._warned and len(self._warned) < 1000:
+        if key not in self._warned and len(self._warned) < MAX_WARNED:
             self._warned.add(key)
             log.warning("%s: %s (logged once)", key, reason)
 
 
 def _open_router(
-    listen: Sequence[endpoints.Endpoint], connect: Sequence[endpoints.Endpoint], settings: dict[str, Any]
+    listen: Sequence[endpoints.Endpoint],
+    connect: Sequence[endpoints.Endpoint],
+    settings: dict[str, Any],
+    max_sessions: int,
 ) -> zenoh.Session:
     """Open a Zenoh router. Raises :class:`PortTaken` if it cannot listen on all endpoints."""
     try:
@@ -521,6 +637,7 @@ def _open_router(
                 connect__exit_on_failure=False,
                 connect__retry={"period_init_ms": 100, "period_max_ms": 400, "period_increase_factor": 2},
                 transport__link__tx__lease=LEASE,
+                transport__unicast__max_sessions=max_sessions,
                 **settings,
             )
         )

@@ -96,7 +96,7 @@ def server_answers_config(root: str) -> dict[str, Any]:
     The settings keep other programs that connect to the server from answering queries that actors send to the server.
     ``root``: first chunks of all keys, like ``vs/1``.
     """
-    questions = [f"{root}/*/{question}" for question in ("clock/**", "join/**", "snap/**", "server/**")]
+    questions = [f"{root}/*/{question}" for question in ("clock/**", "join/**", "holder/**", "snap/**", "server/**")]
     rule = {
         "id": "answers of the server",
         "permission": "deny",
@@ -136,7 +136,9 @@ def acl_config(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
         rule(
             "subscribe", "ingress", ["declare_subscriber", "liveliness_query", "declare_liveliness_subscriber"], world
         ),
-        rule("query", "ingress", ["query"], f"{root}/hello/*", f"{root}/snap/*/*", f"{root}/mesh/*"),
+        rule(
+            "query", "ingress", ["query"], f"{root}/hello/*", f"{root}/holder/*", f"{root}/snap/*/*", f"{root}/mesh/*"
+        ),
         rule("be queried", "egress", ["query"], f"{root}/hello/*"),
         # without declarations of subscribers publishers would never match, and never send
         rule("see queryables", "egress", ["declare_queryable"], world),

@@ -161,6 +161,15 @@ def can_listen(endpoint: Endpoint) -> bool:
         return True
 
 
+def can_connect(endpoint: Endpoint, timeout: float = 1.0) -> bool:
+    """Whether a program accepts connections at the endpoint of a stream. Waits up to ``timeout`` [s]."""
+    try:
+        socket.create_connection((endpoint.host.strip("[]"), endpoint.port), timeout).close()
+    except OSError:
+        return False
+    return True
+
+
 def _free_port(host: str) -> int:
     family = socket.AF_INET6 if host.startswith("[") else socket.AF_INET
     while True:

@@ -3,8 +3,9 @@ holds the name.
 
 A session holds a name once it has declared the liveliness token ``live/<name>/<session>``. If a second session declares
 a token of the same name, members that know the first token still accept the first session. A member that joins while
-both tokens exist accepts neither session until one token is gone. Messages that arrive after their session has left are
-accepted, because the last records of an actor may still be on their way.
+both tokens exist accepts neither session until one token is gone. If the server knows which session joined with the
+name, that one holds it in both cases (:meth:`NameHolders.prefer`), so a token alone takes no name away. Messages that
+arrive after their session has left are accepted, because the last records of an actor may still be on their way.
 
 Without TLS a session states its own identity. This separates programs that use vinesim or Zenoh as intended, but does
 not stop a program that was written to deceive (``docs/network.md``).
@@ -18,6 +19,9 @@ from vinesim.net.codec.messages import FAMILIES, sender_of
 
 MAX_FORMER_SESSIONS = 8
 """Largest number of sessions that have left and are still stored, for one name."""
+
+MAX_FORMER_NAMES = 256
+"""Largest number of names without a live session that are still stored."""
 
 BOUND_FAMILIES = frozenset(name for name, family in FAMILIES.items() if family.is_published) | {"hello"}
 """Families of keys that contain the name of the actor that may send under them, by their first chunk."""
@@ -40,6 +44,10 @@ class NameHolders:
         self._sessions: dict[str, dict[str, bool]] = {}
         """Whether a session is live, by name and session, in the order in which the sessions declared the name."""
         self._holder: dict[str, str] = {}
+        self._preferred: dict[str, str] = {}
+        """Session that the server admitted, by name, for names that several sessions declared."""
+        self._departed: dict[str, None] = {}
+        """Names without a live session, in the order in which they were left."""
         self._disputed: set[str] = set()
         """Names with several live sessions that all declared the name before this member joined."""
         self._lock = threading.Lock()
@@ -69,8 +77,45 @@ class NameHolders:
             for one in former[: len(former) - MAX_FORMER_SESSIONS]:
                 del sessions[one]
             self._choose(name)
-            there = (name for name, sessions in self._sessions.items() if any(sessions.values()))
-            self.live = self._own.union(there)
+            if any(sessions.values()):
+                self._departed.pop(name, None)
+                if name not in self.live:
+                    self.live |= {name}
+                return
+            if name not in self._own:
+                self.live -= {name}
+            self._departed.pop(name, None)
+            self._departed[name] = None
+            while len(self._departed) > MAX_FORMER_NAMES:
+                oldest = next(iter(self._departed))
+                del self._departed[oldest], self._sessions[oldest]
+                self._holder.pop(oldest, None)
+                self._preferred.pop(oldest, None)
+
+    def refresh(self, tokens: list[tuple[str, str]]) -> None:
+        """Store all tokens that exist now, and that all others are gone."""
+        with self._lock:
+            known = [(name, session) for name, sessions in self._sessions.items() for session in sessions]
+        for name, session in {*known} - {*tokens}:
+            self.update(name, session, False)
+        for name, session in tokens:
+            self.update(name, session, True)
+
+    def contested(self) -> list[str]:
+        """Returns the names with several live sessions of which none is preferred."""
+        with self._lock:
+            return [
+                name
+                for name, sessions in self._sessions.items()
+                if sum(sessions.values()) > 1 and not sessions.get(self._preferred.get(name, ""), False)
+            ]
+
+    def prefer(self, name: str, session: str) -> None:
+        """Note that the server admitted a session with a name."""
+        with self._lock:
+            if name in self._sessions:
+                self._preferred[name] = session
+                self._choose(name)
 
     def holder(self, name: str) -> str:
         """Returns the session that holds a name or held it last; empty if there is none."""
@@ -81,7 +126,9 @@ class NameHolders:
         live = [session for session, is_live in self._sessions[name].items() if is_live]
         if len(live) < 2:
             self._disputed.discard(name)
-        if name in self._disputed:
+        if self._preferred.get(name, "") in live:
+            self._holder[name] = self._preferred[name]
+        elif name in self._disputed:
             self._holder.pop(name, None)
         elif live:
             self._holder[name] = live[0]

@@ -6,7 +6,9 @@ new server, and the hello is sent again.
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import math
 import time
 from collections.abc import Callable
 
@@ -22,6 +24,10 @@ log = logging.getLogger(__name__)
 
 RETRY_PERIOD = 0.05
 """Time between two attempts to reach a server that has just started, or was restarted [s]."""
+
+REJOIN_TIMEOUT = 8.0
+"""Time for which the server may refuse a session that replaces another one [s]: it forgets a silent session after its
+lease of 2 s."""
 
 ROS_TOKENS = "@ros2_lv/**"
 """Keys of the liveliness tokens by which nodes with ``rmw_zenoh`` announce themselves and their topics."""
@@ -45,6 +51,9 @@ class ServerAdmission:
         ``endpoint``: text of the server's endpoint. ``is_secured``: whether certificates are used. ``submit(task)``
         runs a function in the bus's own thread."""
         self._session = session
+        self._prefix = prefix
+        self._patient_until = -math.inf
+        """Time until which a refusal is not final, because the server may still know a former session [s]."""
         self._server_key = f"{prefix}server/{name}"
         self._key = f"{prefix}join/{name}/{session.zid()}"
         self._name = name
@@ -121,16 +130,8 @@ class ServerAdmission:
             )
         self.count += bool(welcomes)
         self._was_announced = bool(welcomes)
-        querier = self._session.declare_querier(self._key)
-        self._querier = querier
         self._hello = hello
-
-        def on_matching(status: zenoh.MatchingStatus) -> None:
-            self.is_served = status.matching
-            self._was_announced |= status.matching
-            self._submit_join()
-
-        self._declared.append(querier.declare_matching_listener(on_matching))
+        self._watch_matches()
         if not welcomes:
             self._submit_join()
 
@@ -147,6 +148,44 @@ class ServerAdmission:
             self._submit_join()
         elif self._was_announced and not has_match(self._querier):
             self.is_served = False
+
+    def answers(self, session: zenoh.Session) -> bool:
+        """Whether the server of this world is to be seen from another session. Waits up to
+        :data:`CONNECT_TIMEOUT`."""
+        querier = session.declare_querier(f"{self._prefix}join/{self._name}/{session.zid()}")
+        deadline = time.monotonic() + CONNECT_TIMEOUT
+        while not (found := has_match(querier)) and time.monotonic() < deadline:
+            time.sleep(RETRY_PERIOD)
+        return found
+
+    def move_to(self, session: zenoh.Session) -> None:
+        """Ask for admission again from another session, which replaces the present one."""
+        self._session = session
+        self._key = f"{self._prefix}join/{self._name}/{session.zid()}"
+        self._declared.clear()
+        self._patient_until = time.monotonic() + REJOIN_TIMEOUT
+        self._watch_matches()
+
+    def close(self) -> None:
+        """Undeclare what was declared, because the session closes."""
+        querier, self._querier = self._querier, None
+        if querier is not None:
+            with contextlib.suppress(zenoh.ZError):
+                querier.undeclare()
+        self._declared.clear()
+
+    def _watch_matches(self) -> None:
+        querier = self._session.declare_querier(self._key)
+        self._querier = querier
+
+        def on_matching(status: zenoh.MatchingStatus) -> None:
+            if self._querier is not querier:
+                return  # of a session that was replaced
+            self.is_served = status.matching
+            self._was_announced |= status.matching
+            self._submit_join()
+
+        self._declared.append(querier.declare_matching_listener(on_matching))
 
     def _submit_join(self) -> None:
         """Submit to the bus's own thread to send the hello again, unless that is already submitted."""
@@ -168,6 +207,9 @@ class ServerAdmission:
         if not welcomes:
             time.sleep(RETRY_PERIOD)
             self._submit_join()
+            return
+        if welcomes[0].refused and time.monotonic() < self._patient_until:
+            self.is_served = False  # the server still knows the former session; :meth:`watch` asks again
             return
         self.is_served = True  # whatever Zenoh's threads reported before
         self.rejection = welcomes[0].refused

@@ -19,7 +19,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable
-from typing import Self
+from typing import Any, Self
 
 import zenoh
 
@@ -64,6 +64,14 @@ SILENCE_TIMEOUT = 3.0
 
 DATAGRAM_RETRY_PERIOD = 10.0
 """Time between two attempts to open the session over datagrams again [s]."""
+
+UNSERVED_TIMEOUT = 10.0
+"""Time without the server of this world, while the link to its router works, after which a session is opened anew if
+the server answers there [s]."""
+
+MAX_ASKED_NAMES = 8
+"""Largest number of names that several sessions claim and for which the server is asked in one
+:data:`WATCH_PERIOD`."""
 
 FETCH_TIMEOUT = 10.0
 """Time limit of :meth:`ZenohBus.fetch` [s], long enough for large replies over slow links."""
@@ -134,6 +142,19 @@ class ZenohBus:
         self._next_probe = time.monotonic() + DATAGRAM_RETRY_PERIOD
         self.unreliable: set[BusPublisher | BusSubscription] = set()
         """Best-effort publishers and subscriptions, which use the session of poses."""
+        self.reliable: set[BusPublisher | BusSubscription] = set()
+        """Reliable publishers and subscriptions."""
+        self._unserved_since: float | None = None
+        self._opener: threading.Thread | None = None
+        """Thread that opens a session anew."""
+        self._opened: zenoh.Session | None = None
+        """Session that was opened anew, until it replaces :attr:`_session`."""
+        self.sessions_opened_anew = 0
+        """Number of times that a session was opened anew because the server did not serve the old one."""
+        self._bulk_endpoint = links.bulk
+        self._live = live
+        self._queryables: list[Callable[[], object]] = []
+        """Functions that declare the queryables on the present session."""
         self._session = self._pose_session = open_client(links.bulk, self._credentials)
         self.source = zenoh.SourceInfo(self._session.id, 0)
         """Id of the session that holds the actor's name. All samples have this id, also those of the session of
@@ -149,18 +170,12 @@ class ZenohBus:
         )
         try:
             self._admission.find_server()
-            liveliness = self._session.liveliness()
             self._declared: list[object] = [
                 self._watch_connection(self._session, self.endpoint),
                 *([self._claim_name()] if live else []),
             ]
-            tokens = liveliness.get(f"{self._prefix}live/*/*", timeout=CONNECT_TIMEOUT)
-            self._names.start([_token(reply.ok.key_expr) for reply in tokens if reply.ok is not None])
-            self._declared.append(
-                liveliness.declare_subscriber(
-                    f"{self._prefix}live/*/*", called_directly(self._on_liveliness), history=True
-                )
-            )
+            self._names.start(self._tokens())
+            self._declared.append(self._watch_tokens())
             if links.live is not None:
                 self._pose_session = self._open_datagrams(links.live)
         except BaseException:
@@ -202,6 +217,8 @@ class ZenohBus:
         self._watch_server()
         self._watch_datagrams()
         self._admission.watch()
+        self._watch_service()
+        self._ask_for_holders()
         if (watch := self._certificate_watch) is not None:
             if watch.has_changed():  # Zenoh reads the files at each connection
                 log.warning("%s: its certificates changed: the next connection uses the new ones", self.name)
@@ -220,6 +237,85 @@ class ZenohBus:
         if not self._is_loss_reported and now - self._lost_since >= LOSS_NOTICE:
             self._is_loss_reported = True
             log.warning("%s: lost the server at %s; simulates alone and tries to reconnect", self.name, self.endpoint)
+
+    def _watch_service(self) -> None:
+        """Open a session anew if the server does not serve this one though the link works.
+
+        Another thread opens a session beside the present one. Only if the server answers there, it replaces the present
+        one: if the server is gone from behind a router that works, nothing changes.
+        """
+        if (session := self._opened) is not None:
+            self._opened = None
+            self._replace_session(session)
+        now = time.monotonic()
+        if self._admission.is_served or self.endpoint in self._lost_endpoints:
+            self._unserved_since = None
+            return
+        self._unserved_since = self._unserved_since or now
+        is_opening = self._opener is not None and self._opener.is_alive()
+        if now - self._unserved_since >= UNSERVED_TIMEOUT and not is_opening:
+            self._unserved_since = now
+            self._opener = threading.Thread(target=self._try_anew, name=f"new session of {self.name}", daemon=True)
+            self._opener.start()
+
+    def _try_anew(self) -> None:
+        """Body of the thread that opens a session beside the present one, and keeps it if the server answers there."""
+        try:
+            session = open_client(self._bulk_endpoint, self._credentials)
+        except ServerUnreachable as error:
+            log.warning("%s: %s", self.name, error)
+            return
+        if self._admission.answers(session):
+            self._opened = session
+        else:
+            close_session(session)
+
+    def _replace_session(self, session: zenoh.Session) -> None:
+        """Use another session in the place of the present one, with all that was declared."""
+        log.warning("%s: the server at %s did not serve this session: opened a new one", self.name, self.endpoint)
+        abandoned, self._session = self._session, session
+        self.sessions_opened_anew += 1
+        self.source = zenoh.SourceInfo(session.id, 0)
+        self._lost_endpoints.discard(self.endpoint)
+        close_session(abandoned)  # which withdraws its token, so that the name is free
+        self._declared = [self._watch_connection(session, self.endpoint)]
+        if self._live:
+            self._declared.append(session.liveliness().declare_token(f"{self._prefix}live/{self.name}/{session.zid()}"))
+        self._names.refresh(self._tokens())
+        self._declared.append(self._watch_tokens())
+        self._declared += [declare() for declare in self._queryables]
+        if self._pose_session is abandoned:
+            self._move_poses(session)
+        for entity in list(self.reliable):
+            entity.move_to(session)
+        self._admission.move_to(session)
+
+    def _ask_for_holders(self) -> None:
+        """Ask the server which session it admitted, for names that several sessions claim."""
+        for name in self._names.contested()[:MAX_ASKED_NAMES]:
+            if holder := self._holder(name):
+                self._names.prefer(name, holder)
+
+    def _holder(self, name: str) -> str | None:
+        """Returns the session that the server admitted with a name; empty if it admitted none, None without a
+        server."""
+        replies = self._session.get(f"{self._prefix}holder/{name}", timeout=CONNECT_TIMEOUT)
+        found = [
+            reply.ok.payload.to_string()
+            for reply in replies
+            if reply.ok is not None and self._admission.is_server(reply.replier_id)
+        ]
+        return found[0] if found else None
+
+    def _tokens(self) -> list[tuple[str, str]]:
+        """Returns name and session of all liveliness tokens of the world."""
+        tokens = self._session.liveliness().get(f"{self._prefix}live/*/*", timeout=CONNECT_TIMEOUT)
+        return [_token(reply.ok.key_expr) for reply in tokens if reply.ok is not None]
+
+    def _watch_tokens(self) -> object:
+        return self._session.liveliness().declare_subscriber(
+            f"{self._prefix}live/*/*", called_directly(self._on_liveliness), history=True
+        )
 
     def _watch_datagrams(self) -> None:
         """Move poses to the stream if datagrams stop arriving while the stream works, and back if they arrive again."""
@@ -284,17 +380,18 @@ class ZenohBus:
         )
 
     def _claim_name(self) -> zenoh.LivelinessToken:
-        """Declare the liveliness token of this actor's name. Raises :class:`NameTaken` if another session has one.
+        """Declare the liveliness token of this actor's name. Raises :class:`NameTaken` if another session holds it: by
+        a token, unless the server says that no session joined with the name.
 
         After the declaration the tokens of the name are read again. If two sessions declare the name at once, the later
         one finds the token of the earlier one and leaves. If both read the tokens after both declarations, both leave.
         """
         liveliness = self._session.liveliness()
         mine = str(self._session.zid())
-        if self._name_holders() - {mine}:
+        if self._name_holders() - {mine} and self._holder(self.name) not in ("", mine):
             raise NameTaken(self.name, self.world)
         token = liveliness.declare_token(f"{self._prefix}live/{self.name}/{mine}")
-        if self._name_holders() - {mine}:
+        if self._name_holders() - {mine} and self._holder(self.name) not in ("", mine):
             raise NameTaken(self.name, self.world)
         return token
 
@@ -446,6 +543,7 @@ class ZenohBus:
             replies = self._session.get(
                 self._prefix + key,
                 payload=payload,
+                source_info=self.source,
                 timeout=FETCH_TIMEOUT,
                 priority=zenoh.Priority.BACKGROUND,
                 consolidation=zenoh.ConsolidationMode.NONE,
@@ -473,7 +571,11 @@ class ZenohBus:
                 except zenoh.ZError as error:
                     self.count_failure(error)
 
-        self._declared.append(self._session.declare_queryable(self._prefix + key, on_query))
+        def declare() -> object:
+            return self._session.declare_queryable(self._prefix + key, on_query)
+
+        self._queryables.append(declare)
+        self._declared.append(declare())
 
     def alive(self) -> frozenset[str]:
         return self._names.live
@@ -540,7 +642,16 @@ class ZenohBus:
             self._worker.join(timeout=CONNECT_TIMEOUT)
         if self._probe is not None:
             self._probe.join(timeout=2.0 * CONNECT_TIMEOUT)
-        for session in (self._probed, self._pose_session, self._session):
+        if self._opener is not None:
+            self._opener.join(timeout=3.0 * CONNECT_TIMEOUT)
+        if not self._session.is_closed():
+            # a router of Zenoh 1.10 keeps about 20 kB of the publishers of a session that closes without this
+            for entity in [*self.unreliable, *self.reliable]:
+                entity.undeclare()
+            self._admission.close()
+            for declared in reversed(getattr(self, "_declared", [])):
+                _undeclare(declared)
+        for session in (self._probed, self._opened, self._pose_session, self._session):
             if session is not None:
                 close_session(session)
 
@@ -575,8 +686,7 @@ class BusPublisher:
         self._reliable = reliable
         self._publisher: zenoh.Publisher | None = None
         self._is_closed = self._is_renewing = False
-        if not reliable:
-            bus.unreliable.add(self)
+        (bus.reliable if reliable else bus.unreliable).add(self)
         session = bus.session_for(reliable)
         try:
             self._publisher = declare(session)
@@ -616,9 +726,15 @@ class BusPublisher:
         self._publisher = self._declare(session)
         _undeclare(before)
 
+    def undeclare(self) -> None:
+        """Undeclare the publisher at once, because its bus closes."""
+        self._is_closed = True
+        _undeclare(self._publisher)
+
     def close(self) -> None:
         self._is_closed = True
         self._bus.unreliable.discard(self)
+        self._bus.reliable.discard(self)
         self._bus.submit(lambda: _undeclare(self._publisher))
 
     def _fail(self, error: zenoh.ZError) -> None:
@@ -646,8 +762,7 @@ class BusSubscription:
         self._bus = bus
         self._declare = declare
         self._declared: zenoh.Subscriber | None = None
-        if not reliable:
-            bus.unreliable.add(self)
+        (bus.reliable if reliable else bus.unreliable).add(self)
         bus.submit(lambda: self.move_to(bus.session_for(reliable)))
 
     def move_to(self, session: zenoh.Session) -> None:
@@ -656,13 +771,18 @@ class BusSubscription:
         self._declared = self._declare(session)
         _undeclare(before)
 
+    def undeclare(self) -> None:
+        """Undeclare the subscription at once, because its bus closes."""
+        _undeclare(self._declared)
+
     def close(self) -> None:
         self._bus.unreliable.discard(self)
+        self._bus.reliable.discard(self)
         self._bus.submit(lambda: _undeclare(self._declared))
 
 
-def _undeclare(entity: zenoh.Publisher | zenoh.Subscriber | None) -> None:
-    """Undeclare a publisher or a subscriber. Does nothing if its session is closed."""
+def _undeclare(entity: Any) -> None:
+    """Undeclare a publisher, a subscriber or another entity of Zenoh. Does nothing if its session is closed."""
     if entity is not None:
         with contextlib.suppress(zenoh.ZError):
             entity.undeclare()

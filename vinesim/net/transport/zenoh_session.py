@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import json
 import logging
 import pathlib
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import zenoh
 
 from vinesim.net.codec.header import MAX_MESSAGE
 from vinesim.net.transport.bus import BusError
-from vinesim.net.transport.endpoints import PORT, Endpoint
+from vinesim.net.transport.endpoints import PORT, Endpoint, can_connect
 
 if TYPE_CHECKING:
     from vinesim.net.transport.certificate_watch import CertificateWatch
@@ -44,6 +43,18 @@ class ServerUnreachable(BusError):
         super().__init__(
             f"no vinesim server answers at {endpoint} within {waited:g} s ({reason}): "
             f"start one with 'vinesim server', or give its endpoint, e.g. {endpoint.partition('/')[0]}/HOST:{PORT}"
+        )
+
+
+class SessionRefused(ServerUnreachable):
+    """A program listens at an endpoint and opens no session, like a server with as many sessions as it admits."""
+
+    def __init__(self, endpoint: str, waited: float = CONNECT_TIMEOUT) -> None:
+        BusError.__init__(
+            self,
+            f"{endpoint} accepts connections but opened no session within {waited:g} s: a vinesim server there has as "
+            "many sessions as it admits (its log then has a line, and --max-sessions or --max-clients raises the "
+            "number), or another program listens there",
         )
 
 
@@ -124,31 +135,26 @@ def _close_all() -> None:
         time.sleep(0.005)
 
 
-@contextlib.contextmanager
-def _user_facing(endpoint: str) -> Iterator[None]:
-    """Raise :class:`ServerUnreachable` instead of an error of Zenoh."""
-    try:
-        yield
-    except zenoh.ZError as error:
-        raise ServerUnreachable(endpoint, str(error).split(" at /")[0].rstrip(".")) from error
-
-
 def open_client(endpoint: Endpoint, credentials: dict[str, Any]) -> zenoh.Session:
-    """Open a client session to a router at an endpoint. Raises :class:`ServerUnreachable` if no router answers.
+    """Open a client session to a router at an endpoint. Raises :class:`ServerUnreachable` if no router answers,
+    :class:`SessionRefused` if a program is there that opens no session.
 
     ``credentials``: Zenoh's TLS settings; empty without certificates.
     """
-    with _user_facing(str(endpoint)):
-        return open_session(
-            config(
-                "client",
-                connect__endpoints=[endpoint.locator],
-                connect__timeout_ms=int(1000 * CONNECT_TIMEOUT),
-                connect__exit_on_failure=True,
-                connect__retry={"period_init_ms": 100, "period_max_ms": 400, "period_increase_factor": 2},
-                **credentials,
-            )
-        )
+    settings = config(
+        "client",
+        connect__endpoints=[endpoint.locator],
+        connect__timeout_ms=int(1000 * CONNECT_TIMEOUT),
+        connect__exit_on_failure=True,
+        connect__retry={"period_init_ms": 100, "period_max_ms": 400, "period_increase_factor": 2},
+        **credentials,
+    )
+    try:
+        return open_session(settings)
+    except zenoh.ZError as error:
+        if endpoint.protocol == "tcp" and can_connect(endpoint):
+            raise SessionRefused(str(endpoint)) from error
+        raise ServerUnreachable(str(endpoint), str(error).split(" at /")[0].rstrip(".")) from error
 
 
 def watch_certificates(folder: pathlib.Path, name: str) -> CertificateWatch | None:

@@ -103,19 +103,12 @@ class RobotDescription:
         )
         local = self.moving_joints.poses(np.asarray(position, float))
         found = {self.base: frames.pose([0.0, 0.0, 0.0])}
-
-        def place(link: str) -> np.ndarray:
-            if link not in found:
-                anchor, offset = self.link_anchors[link]
-                if anchor != link:
-                    found[link] = frames.compose(place(anchor), offset)
-                else:
-                    joint = parents[link]
-                    found[link] = frames.compose(place(self.moving_joints.frames[joint][0]), local[joint])
-            return found[link]
-
-        for link in self.link_anchors:
-            place(link)
+        for link, (anchor, offset) in self.link_anchors.items():  # from the root outwards
+            if anchor != link:
+                found[link] = frames.compose(found[anchor], offset)
+            elif link != self.base:
+                joint = parents[link]
+                found[link] = frames.compose(found[self.moving_joints.frames[joint][0]], local[joint])
         return found
 
     def to_spec(self, name: str, index: int = 0, pose: np.ndarray | None = None) -> RobotSpec:

@@ -34,10 +34,10 @@ def home_positions(driven: list[Joint], groups: dict[str, JointGroup]) -> np.nda
     """Returns the home positions [joint] rad or m of the driven joints: those given by their groups, else the middle
     of the range (see :func:`_default_home`)."""
     home = np.array([_default_home(joint) for joint in driven])
-    order = [joint.name for joint in driven]
+    order = {joint.name: index for index, joint in enumerate(driven)}
     for group in groups.values():
         if group.home is not None:
-            home[[order.index(joint) for joint in group.joints]] = group.home
+            home[[order[joint] for joint in group.joints]] = group.home
     return home
 
 
@@ -142,11 +142,13 @@ def _standing_loads(robot: Robot, description: RobotDescription, feet: Mapping[s
         return load
     poses = description.link_poses(description.home)
     share = STANDARD_GRAVITY * description.mass / len(feet)
-    above = {child: description.link_anchors[parent][0] for parent, child in description.moving_joints.frames}
+    spans = _spans(description)
+    first = np.array([spans[foot][0] for foot in feet])
+    ground = np.array(list(feet.values())).reshape(-1, 3)
     joints = {joint.name: joint for joint in robot.joints}
     for name, (_, child) in zip(description.moving_joints.names, description.moving_joints.frames, strict=True):
         axis = frames.rotate(poses[child][3:], joints[name].axis / np.linalg.norm(joints[name].axis))
-        carrying = np.array([place for foot, place in feet.items() if _is_distal(foot, child, above)]).reshape(-1, 3)
+        carrying = ground[(spans[child][0] <= first) & (first < spans[child][1])]
         if joints[name].type == "prismatic":
             load[name] = share * len(carrying) * abs(float(axis[2]))
         else:
@@ -162,7 +164,7 @@ def _carried_loads(robot: Robot, description: RobotDescription) -> tuple[dict[st
     The inertia is about the worst axis through the joint, since the gains must suit any posture of an arm.
     """
     poses = description.link_poses(description.home)
-    above = {child: description.link_anchors[parent][0] for parent, child in description.moving_joints.frames}
+    spans = _spans(description)
     bodies = [(link.name, link.inertial) for link in robot.links if link.inertial is not None and link.inertial.mass]
     mass = np.array([inertial.mass for _, inertial in bodies])
     centre = np.empty((len(bodies), 3))
@@ -171,11 +173,12 @@ def _carried_loads(robot: Robot, description: RobotDescription) -> tuple[dict[st
         offset = inertial.origin[:3, 3] if inertial.origin is not None else np.zeros(3)
         centre[i] = frames.compose(poses[link], frames.pose(offset))[:3]
         own[i] = np.linalg.norm(inertial.inertia, 2) if inertial.inertia is not None else 0.0
+    first = np.array([spans[description.link_anchors[link][0]][0] for link, _ in bodies], int)
     joints = {joint.name: joint for joint in robot.joints}
     carried = {}
     weight = {}
     for name, (_, child) in zip(description.moving_joints.names, description.moving_joints.frames, strict=True):
-        distal = np.array([_is_distal(description.link_anchors[link][0], child, above) for link, _ in bodies])
+        distal = (spans[child][0] <= first) & (first < spans[child][1])
         axis = frames.rotate(poses[child][3:], joints[name].axis / np.linalg.norm(joints[name].axis))
         if joints[name].type == "prismatic":
             carried[name] = float(mass[distal].sum())
@@ -188,9 +191,21 @@ def _carried_loads(robot: Robot, description: RobotDescription) -> tuple[dict[st
     return carried, weight
 
 
-def _is_distal(link: str, joint_child: str, above: dict[str, str]) -> bool:
-    """Returns whether ``link`` is ``joint_child`` or is carried by it. ``above``: parent among the moving links, by
-    moving link."""
-    while link != joint_child and link in above:
-        link = above[link]
-    return link == joint_child
+def _spans(description: RobotDescription) -> dict[str, tuple[int, int]]:
+    """Returns the span [first, end) of each moving link, and of the root link, in a walk through the tree that visits a
+    link before those it carries. So a link carries those whose first number is in its span, itself included."""
+    children: dict[str, list[str]] = {}
+    for parent, child in description.moving_joints.frames:
+        children.setdefault(description.link_anchors[parent][0], []).append(child)
+    first: dict[str, int] = {}
+    spans: dict[str, tuple[int, int]] = {}
+    waiting = [description.base]
+    while waiting:
+        link = waiting[-1]
+        if link not in first:
+            first[link] = len(first)
+            waiting += children.get(link, ())
+        else:
+            spans[link] = first[link], len(first)
+            waiting.pop()
+    return spans

@@ -47,13 +47,14 @@ def moving_joints(robot: Robot, driven: list[str]) -> MovingJoints:
     joint arrays."""
     joints = [joint for joint in robot.joints if joint.type in MOVABLE_JOINT_TYPES]
     origin = np.array([joint_origin(joint) for joint in joints]).reshape(-1, 7)
+    drives = {name: index for index, name in enumerate(driven)}
     axis = np.array([joint.axis / np.linalg.norm(joint.axis) for joint in joints]).reshape(-1, 3)
     sliding = np.array([joint.type == "prismatic" for joint in joints], bool)[:, None]
     turn = np.concatenate([axis, np.zeros((len(joints), 1))], axis=1)
     return MovingJoints(
         names=tuple(joint.name for joint in joints),
         frames=tuple((joint.parent, joint.child) for joint in joints),
-        drive_index=np.array([driven.index(joint.mimic.joint if joint.mimic else joint.name) for joint in joints], int),
+        drive_index=np.array([drives[joint.mimic.joint if joint.mimic else joint.name] for joint in joints], int),
         multiplier=np.array([joint.mimic.multiplier if joint.mimic else 1.0 for joint in joints]),
         offset=np.array([joint.mimic.offset if joint.mimic else 0.0 for joint in joints]),
         origin=origin,

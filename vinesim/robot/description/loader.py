@@ -13,6 +13,7 @@ that stands on legs, and whose file says that it moves freely, gets a free base.
 
 from __future__ import annotations
 
+import collections
 import copy
 import dataclasses
 import logging
@@ -75,6 +76,7 @@ from vinesim.robot.description.urdf import (
     set_friction,
 )
 from vinesim.robot.description.xacro_files import parse_arguments
+from vinesim.scene.robot_limits import counts_objection
 from vinesim.scene.values import SENSOR_KINDS, RenderedMount, SensorPacing
 
 log = logging.getLogger(__name__)
@@ -112,7 +114,7 @@ def load_description(
         raise DescriptionError(f"{name}: the base is {base!r}; give {', '.join(get_args(BaseKind))}") from None
     if is_remote:
         file = pathlib.Path(name)
-        source = RobotSource(read_xml(file), file, None, {})
+        source = RobotSource(_read_remote(file), file, None, {})
     else:
         source = read_source(str(name), parse_arguments(xacro_args))
     loading = _Loading(source, is_remote=is_remote, received=received)
@@ -122,6 +124,15 @@ def load_description(
     if loading.assumed:
         log.warning("%s: assumed: %s", source.file.name, "; ".join(loading.assumed))
     return description
+
+
+def _read_remote(file: pathlib.Path) -> etree._Element:
+    """Returns the XML of a URDF that was received over the network. Its text was searched on arrival, by
+    :func:`vinesim.scene.robot_limits.urdf_objection`. Here its elements are counted as the parser sees them."""
+    root = read_xml(file)
+    if objection := counts_objection(collections.Counter(element.tag for element in root.iter(etree.Element))):
+        raise description_error(file, objection, "give a smaller robot")
+    return root
 
 
 class _Loading:

@@ -6,6 +6,7 @@ start. Meshes are handled in :mod:`vinesim.robot.description.meshes`.
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import math
 import pathlib
@@ -412,8 +413,8 @@ def check_tree(robot: Robot, file: pathlib.Path) -> tuple[str, list[Joint]]:
     joints are not one tree."""
     links = {link.name for link in robot.links}
     for kind, elements in (("link", robot.links), ("joint", robot.joints)):
-        names = [element.name for element in elements]
-        twice = sorted({name for name in names if names.count(name) > 1})
+        counts = collections.Counter(element.name for element in elements)
+        twice = sorted(name for name, count in counts.items() if count > 1)
         if twice:
             raise description_error(file, f"{kind} {twice[0]!r} appears twice", "rename one")
     if "world" in links:
@@ -447,9 +448,9 @@ def check_tree(robot: Robot, file: pathlib.Path) -> tuple[str, list[Joint]]:
             file, f"links {roots[0]!r} and {roots[1]!r} both have no parent", "join them with a fixed joint"
         )
     order: list[Joint] = []
-    waiting = list(children.get(roots[0], [])) if roots else []
+    waiting = collections.deque(children.get(roots[0], []) if roots else [])
     while waiting:
-        joint = waiting.pop(0)
+        joint = waiting.popleft()
         order.append(joint)
         waiting.extend(children.get(joint.child, []))
     if not roots or len(order) < len(robot.joints):
