@@ -25,6 +25,7 @@ from vinesim.scene.berries import VARIETIES
 from vinesim.scene.palette import PaletteTable, resolve
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.plant_import.imported_plant import load_imported_plant
+from vinesim.scene.scene_limits import MAX_SEED, find_excess
 
 MAX_ROBOTS = 10
 """Largest number of robots in one vineyard (CANOPIES D6.4 section 2.3)."""
@@ -325,6 +326,8 @@ def _beside(scene: pathlib.Path, file: str) -> pathlib.Path:
 def _find_error(scene: Scene) -> str:
     """Check rules that the types cannot express. Returns a message with field, error and correction; empty if the scene
     is valid."""
+    if excess := find_excess(scene):
+        return excess
     low, high = scene.fruit.bunches
     if not 0 <= low <= high:
         return f"fruit.bunches is [{low}, {high}]; give [fewest, most] with 0 <= fewest <= most"
@@ -367,6 +370,8 @@ def _find_error(scene: Scene) -> str:
 
 MAX_NODES = 1_000_000
 """Largest number of nodes of uneven ground."""
+MAX_PIXELS = 4_000_000
+"""Largest number of pixels of an image of heights."""
 MAX_SIDE_SLOPE = 1.0
 """[1] Steepest side of a rut, 45 degrees. GUESSED: moist soil slides off steeper sides."""
 _RUT_STEEPNESS = 8.0 / (3.0 * math.sqrt(3.0))
@@ -427,8 +432,14 @@ def load_heights(table: TerrainTable) -> np.ndarray:
     try:
         with Image.open(str(path)) as image:
             mode = image.mode
+            if image.width * image.height > MAX_PIXELS:
+                raise SceneError(
+                    f"terrain.image is {path!r} with {image.width} x {image.height} pixels; give at most {MAX_PIXELS}"
+                )
             pixels = np.asarray(image)
-    except (OSError, UnidentifiedImageError, ValueError):
+    except SceneError:
+        raise
+    except (OSError, UnidentifiedImageError, ValueError, SyntaxError, Image.DecompressionBombError):
         raise SceneError(f"terrain.image is {path!r}, which cannot be read; give a grey PNG of 8 or 16 bits") from None
     if pixels.ndim != 2 or mode not in ("L", "I;16", "I;16B", "I") or min(pixels.shape) < 2:
         raise SceneError(
@@ -458,6 +469,6 @@ def with_seed(scene: Scene, seed: int | None) -> Scene:
     """Returns a copy of the scene with the given seed; None keeps the scene's own seed."""
     if seed is None:
         return scene
-    if not is_whole(seed) or seed < 0:
-        raise SceneError(f"seed is {seed}: give a whole number of 0 or more")
+    if not is_whole(seed) or not 0 <= seed <= MAX_SEED:
+        raise SceneError(f"seed is {seed}: give a whole number of 0 to {MAX_SEED}")
     return msgspec.structs.replace(scene, seed=seed)

@@ -169,7 +169,7 @@ def is_binary_stl(file: str | pathlib.Path) -> bool:
 
 
 def _write(file: pathlib.Path, content: bytes) -> pathlib.Path:
-    if not file.is_file() or file.stat().st_size != len(content):
+    if not file.is_file() or file.read_bytes() != content:
         file.parent.mkdir(parents=True, exist_ok=True)
         part = file.with_name(f"{file.name}.{os.getpid()}")
         part.write_bytes(content)
