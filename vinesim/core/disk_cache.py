@@ -40,7 +40,7 @@ _POLL_PERIOD = 0.02
 """Time between two attempts to get a lock [s]."""
 
 _MARK = b"vscache1"
-"""Begins the last bytes of a file, before the digest of its content."""
+"""Format of the files: begins the last bytes of a file, before the digest of its content."""
 _DIGEST_SIZE = 32
 _TAIL_SIZE = len(_MARK) + _DIGEST_SIZE
 
@@ -112,9 +112,10 @@ def source_digest(*sources: pathlib.Path | str | bytes) -> str:
     """Returns a digest (16 hex digits) of files, of all ``*.py`` and ``*.toml`` files below folders, of texts and
     bytes.
 
-    The digest includes the version of NumPy, because results may differ in the last bit between versions.
+    The digest includes the format of the cache's files, and the version of NumPy, because results may differ in the
+    last bit between versions.
     """
-    h = hashlib.blake2b(np.__version__.encode(), digest_size=8)
+    h = hashlib.blake2b(_MARK + np.__version__.encode(), digest_size=8)
     for source in sources:
         if isinstance(source, pathlib.Path):
             files = [source]

@@ -13,6 +13,8 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from vinesim.core.errors import one_line
+
 T = TypeVar("T", bound=msgspec.Struct)
 
 _KINDS = {
@@ -37,6 +39,9 @@ _MAX_SHOWN = 200
 
 class DataError(ValueError):
     """Raised for a data file that cannot be used. The message is one line."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(one_line(message))
 
 
 def load_toml(path: pathlib.Path, kind: type[T], error: type[DataError] = DataError) -> T:
@@ -68,6 +73,8 @@ def read_toml(path: pathlib.Path, error: type[DataError] = DataError) -> dict[st
     for place, value in leaves:
         if isinstance(value, float) and not math.isfinite(value):
             raise error(f"{path}: {_shown(place)} is {value}; give a finite number")
+        if isinstance(value, int) and not -(1 << 63) <= value < 1 << 63:
+            raise error(f"{path}: {_shown(place)} has more than 64 bits; give a smaller number")
     return data
 
 

@@ -118,4 +118,6 @@ def _entries(data: Any, place: str = "") -> Iterator[tuple[str, Any]]:
 
 def _short(value: float) -> str:
     """Returns a number as text; a whole number may have thousands of digits."""
-    return str(value) if isinstance(value, int) and abs(value) < 10**20 else f"{value:.10g}"
+    if isinstance(value, float):
+        return f"{value:.10g}"
+    return str(value) if value.bit_length() < 65 else f"a number of {value.bit_length()} bits"

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from vinesim.core.data_files import DataFileNotFound, find_data_file
+from vinesim.core.data_files import DataFileNotFound, find_data_file, is_file
 from vinesim.core.geodesy import APRILIA, Geodetic
 from vinesim.core.numbers import is_whole
 from vinesim.core.toml_loader import DataError, load_toml
@@ -320,7 +320,7 @@ def check_scene(scene: Scene, source: str) -> Scene:
 def _beside(scene: pathlib.Path, file: str) -> pathlib.Path:
     """Returns the path of a file that a scene names: in the scene's folder if the file exists there, else ``file``
     unchanged."""
-    return near if (near := scene.parent / file).is_file() else pathlib.Path(file)
+    return near if is_file(near := scene.parent / file) else pathlib.Path(file)
 
 
 def _find_error(scene: Scene) -> str:

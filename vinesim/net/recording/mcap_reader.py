@@ -19,7 +19,7 @@ from typing import IO, NamedTuple, overload
 import msgspec
 import numpy as np
 from mcap.exceptions import EndOfFile, InvalidMagic
-from mcap.records import Channel, Chunk, Header, Message, Metadata
+from mcap.records import Channel, Chunk, Header, Message, Metadata, Statistics
 
 from vinesim.core import mcap_chunks
 from vinesim.net.codec.header import PROTOCOL
@@ -217,14 +217,19 @@ def read_recording(path: pathlib.Path) -> Recording:
         with path.open("rb") as file:
             try:
                 before = 0
+                expected: int | None = None
                 for record in mcap_chunks.records(file, MAX_RECORD_LENGTH):
                     if isinstance(record, Header):
                         profile = record.profile
+                    elif isinstance(record, Statistics):
+                        expected = record.message_count
                     elif isinstance(record, Metadata) and record.name == METADATA_NAME:
                         metadata |= record.metadata
                     else:
                         index.add(record, before, file.tell())
                     before = file.tell()
+                if expected not in (None, len(index.times)):
+                    damage = f"{len(index.times)} of its {expected} messages are there"
             except InvalidMagic:
                 if file.tell() <= 8:
                     kind = "no MCAP file" if file.tell() else "empty"
