@@ -132,7 +132,7 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
     ),
     "file_fuzz": (
         _file_fuzz,
-        "read corrupted caches, journals, recordings, scenes, URDFs, MTGs and PLYs",
+        "read corrupted caches, journals, recordings, scenes, robots and plants",
         {
             "files": {"type": int, "default": 10_000, "help": "number of files of each kind"},
             "seed": {"type": int, "default": 1, "help": "seed of the faults"},

@@ -23,9 +23,11 @@ import types
 from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
+from mcap.writer import Writer
 
 from vinesim.client.recording.replay import Playhead
 from vinesim.core import disk_cache
+from vinesim.core.bag_files import BagError, open_bag
 from vinesim.core.data_files import data_dir, user_folders
 from vinesim.core.toml_loader import DataError
 from vinesim.net.codec.control import Hello, RetainedRecord, encode_hello, encode_records
@@ -36,10 +38,11 @@ from vinesim.net.replication.retained import RetainedState
 from vinesim.net.server.admission import SceneId
 from vinesim.net.server.journal import Journal, JournalError
 from vinesim.robot.description.loader import load_description
+from vinesim.robot.description.sidecar import read_sidecar
 from vinesim.robot.description.urdf import DescriptionError
 from vinesim.scene import scene_limits
 from vinesim.scene.ids import ObjectKind, object_id
-from vinesim.scene.plant_import.imported_plant import import_plant
+from vinesim.scene.plant_import.imported_plant import ImportedPlant, import_plant, load_imported_plant
 from vinesim.scene.plant_import.skeleton import MAX_HEIGHT
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import Measurement
@@ -239,6 +242,7 @@ def make_kinds(folder: pathlib.Path) -> dict[str, Kind]:
         "cache": _cache(folder / "cache"),
         "journal": _journal(folder / "journal"),
         "recording": _recording(folder / "recording"),
+        "bag": _bag(folder / "bag"),
         "scene": Kind(
             ".toml",
             (*(file.read_bytes() for file in sorted((data_dir() / "scenes").glob("*.toml"))), _FULL_SCENE),
@@ -246,8 +250,12 @@ def make_kinds(folder: pathlib.Path) -> dict[str, Kind]:
             (DataError,),
         ),
         "urdf": Kind(".urdf", (_ROBOT,), _read_robot, (DescriptionError,)),
+        "robot TOML": Kind(
+            ".sidecar", ((data_dir() / "robots" / "vinebot.toml").read_bytes(),), _read_sidecar, (DescriptionError,)
+        ),
         "mtg": Kind(".mtg", ((plants / "vine.mtg").read_bytes(),), _read_plant, (DataError,)),
         "ply": Kind(".ply", ((plants / "vine.ply").read_bytes(), _PLY, _binary_ply()), _read_plant, (DataError,)),
+        "plant": Kind(".plant", ((plants / "vine.toml").read_bytes(),), _read_imported, (DataError,)),
     }
 
 
@@ -406,6 +414,38 @@ def _recording(folder: pathlib.Path) -> Kind:
     return Kind(".mcap", tuple(samples), read, (InvalidRecording,), is_text=False)
 
 
+def _bag(folder: pathlib.Path) -> Kind:
+    folder.mkdir()
+    samples = []
+    allowed = set()
+    for topic in ("/joint_states", "/tf"):
+        with (folder / "run.mcap").open("wb") as file:
+            writer = Writer(file, chunk_size=300)
+            writer.start(profile="ros2")
+            channel = writer.register_channel(
+                topic, "cdr", writer.register_schema("std_msgs/msg/Empty", "ros2msg", b"")
+            )
+            for i in range(40):
+                writer.add_message(channel, log_time=i, publish_time=i, data=f"{topic} {i}".encode() * 5)
+                allowed.add((topic, i, f"{topic} {i}".encode() * 5))
+            writer.finish()
+        samples.append((folder / "run.mcap").read_bytes())
+    topics = {topic for topic, _, _ in allowed}
+
+    def read(path: pathlib.Path) -> bool:
+        bag = open_bag(path)
+        found = [(message.topic, message.time, message.data) for message in bag.messages()]
+        for topic, at, data in found:
+            # no checksum covers the summary, which has the names of the topics
+            if (at, data) not in {one[1:] for one in allowed} and bag.topics.keys() <= topics:
+                raise WrongContent(f"a message of {topic!r} with {len(data)} bytes was never written")
+        if "\n" in bag.damage:
+            raise WrongContent("the damage is told in several lines")
+        return not bag.damage
+
+    return Kind(".bag", tuple(samples), read, (BagError,), is_text=False)
+
+
 def _read_scene(path: pathlib.Path) -> bool:
     scene = load_scene(path)
     if excess := scene_limits.find_excess(scene):
@@ -424,8 +464,20 @@ def _read_robot(path: pathlib.Path) -> bool:
     return True
 
 
+def _read_sidecar(path: pathlib.Path) -> bool:
+    read_sidecar(path)
+    return True
+
+
 def _read_plant(path: pathlib.Path) -> bool:
-    plant = import_plant(path)
+    return _check_plant(import_plant(path))
+
+
+def _read_imported(path: pathlib.Path) -> bool:
+    return _check_plant(load_imported_plant.__wrapped__(str(path)))  # the file changes under the cache
+
+
+def _check_plant(plant: ImportedPlant) -> bool:
     points = plant.skeleton()
     size = np.linalg.norm(points.position, axis=1)
     nodes = np.arange(len(size))

@@ -10,7 +10,10 @@ import pytest
 from benchmarks import file_fuzz
 
 
-@pytest.mark.parametrize("kind", ["cache", "journal", "recording", "scene", "urdf", "mtg", "ply"])
+KINDS = ["cache", "journal", "recording", "bag", "scene", "urdf", "robot TOML", "mtg", "ply", "plant"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_corrupted_file_is_refused_with_one_line_or_read_rightly(tmp_path: pathlib.Path, kind: str) -> None:
     """A hundred here; ``python -m benchmarks file_fuzz`` reads ten thousand of each kind."""
     done = file_fuzz.run(file_fuzz.make_kinds(tmp_path)[kind], 100, seed=3, folder=tmp_path)
