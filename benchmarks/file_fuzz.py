@@ -22,6 +22,7 @@ import time
 import types
 from collections.abc import Callable, Iterator, Mapping
 
+import msgspec
 import numpy as np
 from mcap.writer import Writer
 
@@ -448,7 +449,7 @@ def _bag(folder: pathlib.Path) -> Kind:
 
 def _read_scene(path: pathlib.Path) -> bool:
     scene = load_scene(path)
-    if excess := scene_limits.find_excess(scene):
+    if excess := scene_limits.find_excess(msgspec.to_builtins(scene)):
         raise WrongContent(excess)
     if not (path.parent / f"{scene.name}.png").resolve().parent == path.parent.resolve():
         raise WrongContent(f"name {scene.name!r} leaves the folder")

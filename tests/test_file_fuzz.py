@@ -9,7 +9,6 @@ import pytest
 
 from benchmarks import file_fuzz
 
-
 KINDS = ["cache", "journal", "recording", "bag", "scene", "urdf", "robot TOML", "mtg", "ply", "plant"]
 
 

@@ -5,12 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
-
-import msgspec
-
-if TYPE_CHECKING:
-    from vinesim.scene.spec import Scene
+from typing import Any
 
 MAX_VINES = 10_000
 """Largest number of vines of a scene; a hectare has about 4,000."""
@@ -65,15 +60,15 @@ LENGTHS = {"boxes": 1000, "imported": 1000, "layout.missing": MAX_VINES, "fruit.
 _NAME = re.compile(r"(?!\.)[^\W_](?:[\w .,+()-]{0,46}[\w.+()-])?")
 
 
-def find_excess(scene: Scene) -> str:
-    """Returns a message with field, value and limit if a number, list or name of ``scene`` is beyond its limit; empty
-    otherwise."""
-    if not _NAME.fullmatch(scene.name):
+def find_excess(scene: dict[str, Any]) -> str:
+    """Returns a message with field, value and limit if a number, list or name of a scene is beyond its limit; empty
+    otherwise. ``scene``: the tables of a whole scene, with all defaults."""
+    if not _NAME.fullmatch(scene["name"]):
         return (
-            f"name is {scene.name[:60]!r}; give 1 to 48 letters, digits, blanks or .,_+()-, beginning with a letter or "
+            f"name is {scene['name'][:60]!r}; give 1 to 48 letters, digits, blanks or .,_+()-, beginning with a letter or "
             "digit: files are named after it"
         )
-    for place, value in _entries(msgspec.to_builtins(scene)):
+    for place, value in _entries(scene):
         path = re.sub(r"\[\d+\]", "[]", place)
         if isinstance(value, list):
             if len(value) > (most := LENGTHS.get(path, len(value))):
@@ -84,21 +79,19 @@ def find_excess(scene: Scene) -> str:
                 return f"{place} is {_short(value)}; give {_short(low)} to {_short(high)} {unit}".rstrip()
         elif not -MAX_NUMBER <= value <= MAX_NUMBER:
             return f"{place} is {_short(value)}; give a number of at most {MAX_NUMBER:g}"
-    layout = scene.layout
-    if layout.rows * layout.vines > MAX_VINES:
-        return (
-            f"layout.rows x layout.vines is {layout.rows} x {layout.vines}; give at most {MAX_VINES} vines, or several "
-            "scenes"
-        )
+    rows, vines = (scene["layout"][name] for name in ("rows", "vines"))
+    if rows * vines > MAX_VINES:
+        return f"layout.rows x layout.vines is {rows} x {vines}; give at most {MAX_VINES} vines, or several scenes"
     for name, count, spacing in (
-        ("rows", layout.rows, layout.row_spacing),
-        ("vines", layout.vines, layout.vine_spacing),
+        ("rows", rows, scene["layout"]["row_spacing"]),
+        ("vines", vines, scene["layout"]["vine_spacing"]),
     ):
         if count * spacing > MAX_COORDINATE:
             return f"layout.{name} reach {count * spacing:g} m; give at most {MAX_COORDINATE:g} m"
-    if layout.rows * layout.vines * scene.fruit.bunches[1] > MAX_BUNCHES:
-        most = MAX_BUNCHES // (layout.rows * layout.vines)
-        return f"fruit.bunches is {list(scene.fruit.bunches)}; give at most {most} on a vine: {MAX_BUNCHES} in a scene"
+    bunches = list(scene["fruit"]["bunches"])
+    if rows * vines * bunches[1] > MAX_BUNCHES:
+        most = MAX_BUNCHES // (rows * vines)
+        return f"fruit.bunches is {bunches}; give at most {most} on a vine: {MAX_BUNCHES} in a scene"
     return ""
 
 

@@ -326,7 +326,7 @@ def _beside(scene: pathlib.Path, file: str) -> pathlib.Path:
 def _find_error(scene: Scene) -> str:
     """Check rules that the types cannot express. Returns a message with field, error and correction; empty if the scene
     is valid."""
-    if excess := find_excess(scene):
+    if excess := find_excess(msgspec.to_builtins(scene)):
         return excess
     low, high = scene.fruit.bunches
     if not 0 <= low <= high:
