@@ -65,8 +65,8 @@ def find_excess(scene: dict[str, Any]) -> str:
     otherwise. ``scene``: the tables of a whole scene, with all defaults."""
     if not _NAME.fullmatch(scene["name"]):
         return (
-            f"name is {scene['name'][:60]!r}; give 1 to 48 letters, digits, blanks or .,_+()-, beginning with a letter or "
-            "digit: files are named after it"
+            f"name is {scene['name'][:60]!r}; give 1 to 48 letters, digits, blanks or .,_+()-, beginning with a letter "
+            "or digit: files are named after it"
         )
     for place, value in _entries(scene):
         path = re.sub(r"\[\d+\]", "[]", place)
