@@ -20,12 +20,11 @@ from vinesim.core.data_files import DataFileNotFound, find_data_file, is_file
 from vinesim.core.geodesy import APRILIA, Geodetic
 from vinesim.core.numbers import is_whole
 from vinesim.core.toml_loader import DataError, load_toml
-from vinesim.scene import plant_parameters
+from vinesim.scene import plant_parameters, scene_limits
 from vinesim.scene.berries import VARIETIES
 from vinesim.scene.palette import PaletteTable, resolve
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.plant_import.imported_plant import load_imported_plant
-from vinesim.scene.scene_limits import MAX_SEED, find_excess
 
 MAX_ROBOTS = 10
 """Largest number of robots in one vineyard (CANOPIES D6.4 section 2.3)."""
@@ -326,7 +325,7 @@ def _beside(scene: pathlib.Path, file: str) -> pathlib.Path:
 def _find_error(scene: Scene) -> str:
     """Check rules that the types cannot express. Returns a message with field, error and correction; empty if the scene
     is valid."""
-    if excess := find_excess(msgspec.to_builtins(scene)):
+    if excess := scene_limits.find_excess(msgspec.to_builtins(scene)):
         return excess
     low, high = scene.fruit.bunches
     if not 0 <= low <= high:
@@ -469,6 +468,6 @@ def with_seed(scene: Scene, seed: int | None) -> Scene:
     """Returns a copy of the scene with the given seed; None keeps the scene's own seed."""
     if seed is None:
         return scene
-    if not is_whole(seed) or not 0 <= seed <= MAX_SEED:
-        raise SceneError(f"seed is {seed}: give a whole number of 0 to {MAX_SEED}")
+    if not is_whole(seed) or not 0 <= seed <= scene_limits.MAX_SEED:
+        raise SceneError(f"seed is {seed}: give a whole number of 0 to {scene_limits.MAX_SEED}")
     return msgspec.structs.replace(scene, seed=seed)
