@@ -71,6 +71,13 @@ def _fuzz(messages: int, false_messages: int) -> Iterator[Measurement]:
     return _call("message_fuzz:fuzz")(messages, false_messages)
 
 
+def _file_fuzz(files: int, seed: int, first: int, kinds: str) -> Iterator[Measurement]:
+    for option, value in (("files", files), ("seed", seed), ("first", first)):
+        if value < 0:
+            raise UsageError(f"--{option} is {value}: give 0 or more")
+    return _call("file_fuzz:file_fuzz")(files, seed, first, kinds, _announce)
+
+
 def _soak(minutes: float, real_time_factor: float | None) -> Iterator[Measurement]:
     if minutes <= 0.0:
         raise UsageError(f"--minutes is {minutes:g}: give more than 0")
@@ -155,6 +162,16 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
                 "default": 0,
                 "help": "number of series of false messages (needs hypothesis)",
             },
+        },
+    ),
+    "file_fuzz": (
+        _file_fuzz,
+        "read corrupted caches, journals, recordings, scenes, robots and plants",
+        {
+            "files": {"type": int, "default": 10_000, "help": "number of files of each kind"},
+            "seed": {"type": int, "default": 1, "help": "seed of the faults"},
+            "first": {"type": int, "default": 0, "help": "number of the first file"},
+            "kinds": {"default": "", "help": "names of kinds with commas between them (default: all)"},
         },
     ),
     "kill": (

@@ -97,6 +97,34 @@ def test_a_changed_bit_of_an_array_is_found(cache: pathlib.Path) -> None:
     assert make.calls == 2
 
 
+def test_a_wrong_byte_anywhere_is_found_and_told_in_one_line(
+    cache: pathlib.Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Also in the head of an array, where NumPy's reader raises errors of Python's tokenizer."""
+    load_or_make("table", "0", Maker())
+    path = entry(cache)
+    whole = path.read_bytes()
+    for at in (*range(0, len(whole), 7), whole.index(b"}"), len(whole) - 1):
+        make = Maker()
+        path.write_bytes(whole[:at] + bytes((whole[at] ^ 0x5D,)) + whole[at + 1 :])
+        caplog.clear()
+        assert_same(load_or_make("table", "0", make))
+        assert make.calls == 1
+        (line,) = [record.getMessage() for record in caplog.records]
+        assert str(path) in line
+        assert "is made anew" in line
+        assert "\n" not in line
+        assert path.read_bytes() == whole
+
+
+def test_a_file_under_another_name_is_not_read(cache: pathlib.Path) -> None:
+    load_or_make("table", "0", lambda: {"a": np.ones(3)})
+    entry(cache).rename(cache / "table-1.npz")
+    make = Maker()
+    assert_same(load_or_make("table", "1", make))
+    assert make.calls == 1
+
+
 def test_a_pickle_is_never_loaded(cache: pathlib.Path) -> None:
     make = Maker()
     load_or_make("table", "0", make)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import resource
 
 import pytest
 from hypothesis import given
@@ -144,6 +145,48 @@ def test_a_file_of_another_format_is_refused_and_left_unchanged(tmp_path, conten
     assert "w.facts" in str(caught.value)
     assert "--state-dir" in str(caught.value)
     assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("w.facts", content)]
+
+
+@pytest.fixture
+def full_disk():
+    """Context manager under which no file grows beyond some bytes, which the operating system enforces."""
+
+    @contextlib.contextmanager
+    def limited(size):
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    return limited
+
+
+def test_a_torn_journal_on_a_full_disk_is_one_line_and_loses_nothing(tmp_path, full_disk):
+    with new_journal(tmp_path) as journal:
+        for index in range(20):
+            add(journal, (0, 0), record(index))
+    torn = journal.path.read_bytes()[:-3]
+    journal.path.write_bytes(torn)
+    with (
+        full_disk(100),
+        pytest.raises(JournalError, match=r"w\.facts: torn .* cannot be written .*make room") as caught,
+    ):
+        load_all(tmp_path)
+    assert "\n" not in str(caught.value)
+    assert caught.value.exit_code == 4
+    assert [one.name for one in tmp_path.iterdir()] == ["w.facts"]
+    assert journal.path.read_bytes() == torn
+    assert len(load_all(tmp_path)["w"].state) == 19
+    assert (tmp_path / "w.facts.torn-1").read_bytes() == torn
+
+
+def test_an_unfinished_backup_is_removed(tmp_path):
+    new_journal(tmp_path).close()
+    (tmp_path / "w.facts.torn-1.part").write_bytes(b"x")
+    load_all(tmp_path)
+    assert [one.name for one in tmp_path.iterdir()] == ["w.facts"]
 
 
 def test_a_file_of_another_world_is_refused(tmp_path):

@@ -10,13 +10,17 @@ import json
 import os
 import pathlib
 import time
+import tracemalloc
 
 import numpy as np
 import pytest
+import zstandard
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.data_stream import RecordBuilder
 from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
+from mcap.records import Chunk, DataEnd, Footer, Header, Metadata
 from mcap.writer import Writer
 
 from tests.support.waiting import deadline
@@ -34,6 +38,8 @@ from vinesim.net.recording.mcap_writer import RecordingStopped, RecordingWriter,
 from vinesim.rigid.human_posture import standing_pose
 from vinesim.scene.ids import ObjectKind, object_id
 from vinesim.scene.values import POINT_NAMES, HumanUpdate
+
+MAGIC = b"\x89MCAP0\r\n"
 
 
 def write(path: pathlib.Path, entries: list[tuple[int, str, bytes]], **about: str) -> pathlib.Path:
@@ -334,7 +340,7 @@ def test_a_disk_that_is_full_from_the_start_leaves_no_file_and_the_same_command_
     assert not path.exists()
     assert free_path(path) == path
     RecordingWriter(path).close()
-    assert read_recording(path).messages == []
+    assert not read_recording(path).messages
 
 
 @pytest.mark.parametrize(
@@ -369,3 +375,86 @@ def test_a_recording_is_readable_while_it_is_written(tmp_path):
             make_reader(unfinished).get_summary()
     with path.open("rb") as finished:
         assert make_reader(finished).get_summary().statistics.message_count == 1
+
+
+def bomb(path: pathlib.Path, size: int, chunks: int = 1, said: int | None = None) -> pathlib.Path:
+    """Write a recording whose chunks unpack to ``size`` zeros each; they say that it is ``said``."""
+    packer = zstandard.ZstdCompressor().compressobj(size=size)
+    block = bytes(1 << 20)
+    packed = b"".join(packer.compress(block) for _ in range(size >> 20)) + packer.flush()
+    with path.open("wb") as file:
+        file.write(MAGIC)
+        for entry in (
+            Header(profile="", library=""),
+            Metadata("vinesim", {"protocol": str(PROTOCOL)}),
+            *[Chunk("zstd", packed, 0, 0, 0, size if said is None else said)] * chunks,
+            DataEnd(0),
+            Footer(0, 0, 0),
+        ):
+            builder = RecordBuilder()
+            entry.write(builder)
+            file.write(builder.end())
+        file.write(MAGIC)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("size", "more", "reason"),
+    [
+        (2 << 30, {}, "more than 200 times its size"),
+        (2 << 30, {"said": 1 << 20}, "says it unpacks to 1048576 bytes, which is wrong"),
+        (60 << 20, {"chunks": 30}, "more than 200 times its size"),
+    ],
+    ids=["honest", "lying", "many chunks"],
+)
+def test_a_file_that_unpacks_to_gigabytes_ends_with_one_line(tmp_path, size, more, reason):
+    path = bomb(tmp_path / "bomb.mcap", size, **more)
+    assert path.stat().st_size < 100_000
+    tracemalloc.start()
+    begin = time.process_time()
+    recording = read_recording(path)
+    elapsed = time.process_time() - begin
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert not recording.messages
+    assert reason in recording.damage
+    assert "\n" not in recording.damage
+    assert elapsed < 5.0
+    assert peak < 100e6
+
+
+def test_a_recording_is_not_held_in_memory(tmp_path):
+    """30 MB of messages need 22 bytes each and the chunk that is read."""
+    rng = np.random.default_rng(3)
+    count = 15_000
+    path = write(tmp_path / "long.mcap", [(i * 10**6, "tree/0/0/ada", rng.bytes(1500)) for i in range(count)])
+    assert path.stat().st_size > 20e6
+    tracemalloc.start()
+    recording = read_recording(path)
+    total = sum(len(entry.payload) for entry in recording.messages)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert total == 1500 * count
+    assert peak < 10e6
+
+
+def test_messages_are_read_in_any_order(tmp_path):
+    entries = [(at * 10**6, f"live/{'ab'[at % 2]}", bytes((at % 256,)) * 2000) for at in range(3000)]
+    recording = read_recording(write(tmp_path / "run.mcap", entries))
+    expected = [payload for _, _, payload in entries]
+    order = np.random.default_rng(1).permutation(len(entries))[:200]
+    assert [recording.messages[int(i)].payload for i in order] == [expected[i] for i in order]
+    assert [entry.payload for entry in recording.messages[-3:]] == expected[-3:]
+    assert [entry.payload for entry in recording.messages.of("live", first=10, last=13)] == expected[10:13]
+    assert not list(recording.messages.of("hello"))
+    assert recording.actors == ["a", "b"]
+
+
+def test_messages_that_are_missing_without_damage_are_told(tmp_path):
+    """A chunk of which 36 bytes are zeros looks like an empty one; the statistics count its messages."""
+    path = write(tmp_path / "run.mcap", [(i * 10**6, "live/ada", b"\1") for i in range(50)])
+    content = bytearray(path.read_bytes())
+    at = content.index(b"zstd") - 16
+    content[at : at + 36] = bytes(36)
+    path.write_bytes(content)
+    assert "0 of its 50 messages are there" in read_recording(path).damage

@@ -180,7 +180,11 @@ BAD = {
     "blanks for tabs": ("plant.mtg", HEAD + "ENTITY-CODE XX YY ZZ\n/P1 0 0 0\n", "line 10: has no tabs; separate"),
     "two of three axes": ("plant.mtg", TABLE + "/P1\t\t\t0\t0\n", "line 11: has XX and YY alone; give XX, YY and ZZ"),
     "both decimals": ("plant.mtg", TABLE + "/P1\t\t\t0.5\t0,5\t0\n", "yy is '0,5', and other numbers have"),
-    "negative diameter": ("plant.mtg", TABLE + "/E1\t\t\t0\t0\t0\t-1\n^<E2\t\t\t0\t0\t9\n", "give one above 0, or 0"),
+    "negative diameter": (
+        "plant.mtg",
+        TABLE + "/E1\t\t\t0\t0\t0\t-1\n^<E2\t\t\t0\t0\t9\n",
+        "1e-05 m or more, or 0",
+    ),
     "thick": ("plant.mtg", TABLE + "/E1\t\t\t0\t0\t0\t9\n^<E2\t\t\t0\t0\t9\n", "give the unit of diameters, up to"),
     "picture": ("plant.ply", "ply\n" + "\0" * 90, "has no line 'end_header'"),
     "long row": (

@@ -2,8 +2,10 @@
 
 import math
 import pathlib
+import time
 
 import pytest
+from PIL import Image
 
 from vinesim.core.data_files import data_dir
 from vinesim.scene import spec
@@ -101,6 +103,59 @@ def test_an_error_is_one_line_with_file_place_and_remedy(error, tmp_path):
     assert "\n" not in text
     assert text.startswith(f"{file}: ")
     assert [e for e in expected if e not in text] == [], text
+
+
+ABSURD = {
+    "name of another folder": (('"small"', '"../../x"'), ["name is '../../x'", "letters"]),
+    "hidden name": (('"small"', '".small"'), ["name is", "letters"]),
+    "long name": (('"small"', f'"{"x" * 300}"'), ["name is", "48"]),
+    "rows": (("rows = 1", "rows = 1_000_000_000"), ["layout.rows is 1000000000", "1 to 10000"]),
+    "vines": (("rows = 1\nvines = 2", "rows = 9000\nvines = 9000"), ["9000 x 9000", "10000 vines"]),
+    "spacing": (("row_spacing = 2.5", "row_spacing = 1e8"), ["layout.row_spacing", "100 m"]),
+    "extent": (("vines = 2", "vines = 9999"), ["layout.vines reach 24997.5 m", "10000 m"]),
+    "height": (("height = 2.0", "height = 1e300"), ["layout.height is 1e+300", "10 m"]),
+    "place": (("x = 1.0", "x = -1e300"), ["boxes[0].x is -1e+300", "10000 m"]),
+    "mass": (("y = 1.0", "y = 1.0\nmass = 1e300"), ["boxes[0].mass is 1e+300", "kg"]),
+    "bunches": (("[2, 4]", "[2, 4000]"), ["fruit.bunches[1] is 4000", "0 to 1000"]),
+    "many bunches": (("vines = 2", "vines = 3000"), ["fruit.bunches is [2, 40]", "at most 33 on a vine"]),
+    "digits": (("seed = 1", f"seed = {'9' * 5000}"), ["not valid TOML", "digits"]),
+    "bits": (("seed = 1", f"seed = 0x{'f' * 5000}"), ["seed has more than 64 bits"]),
+    "step": (("[fruit]", "[physics]\ndt = 1e300\n[fruit]"), ["physics.dt is 1e+300", "0.1 s"]),
+    "lists": (("seed = 1", f"seed = {'[' * 20_000}{']' * 20_000}"), ["more than 50 deep"]),
+    "tables": (("seed = 1", f"seed = {'{a=' * 20_000}1{'}' * 20_000}"), ["more than 50 deep"]),
+    "dotted key": (("[fruit]", f"[{'a.' * 20_000}a]\n[fruit]"), ["more than 50 deep"]),
+    "long list": (("height = 2.0", f"height = [{'1,' * 10_000}]"), ["layout.height is [1, 1", "give a number"]),
+    "large file": (("[fruit]", f"#{'x' * (4 << 20)}\n[fruit]"), ["more than 4 MiB"]),
+    "path": (("[layout]", f'plants = "{"x" * 300}"\n[layout]'), ["plants is", "no file"]),
+}
+
+
+@pytest.mark.parametrize("error", ABSURD)
+def test_an_absurd_scene_is_one_line_before_memory_or_time_is_spent(error, tmp_path):
+    (old, new), parts = ABSURD[error]
+    file = tmp_path / "bad.toml"
+    text = GOOD.replace("[2, 4]", "[2, 40]") if error == "many bunches" else GOOD
+    assert old in text
+    file.write_text(text.replace(old, new, 1))
+    begin = time.process_time()
+    with pytest.raises(spec.SceneError) as caught:
+        spec.load_scene(file)
+    assert time.process_time() - begin < 1.0
+    line = str(caught.value)
+    assert line.startswith(f"{file}: ")
+    assert "\n" not in line
+    assert len(line) <= 1000
+    for part in parts:
+        assert part in line
+
+
+def test_an_image_of_heights_that_unpacks_to_gigabytes_is_refused(tmp_path):
+    """80 million pixels are 80 kB as a PNG."""
+    Image.new("L", (20_000, 4_000)).save(tmp_path / "heights.png")
+    file = tmp_path / "bad.toml"
+    file.write_text(GOOD + '\n[terrain]\nimage = "heights.png"\n')
+    with pytest.raises(spec.SceneError, match="20000 x 4000 pixels; give at most 4000000"):
+        spec.load_scene(file)
 
 
 def test_an_unknown_scene_is_refused_with_the_shipped_ones():

@@ -15,6 +15,7 @@ import numpy as np
 from vinesim.cli.signals import stop_at_signals
 from vinesim.core.errors import UsageError, writing
 from vinesim.net.codec.control import decode_hello
+from vinesim.net.codec.header import MessageError
 from vinesim.net.codec.human import decode_pose
 from vinesim.net.codec.messages import sender_of
 from vinesim.net.recording.mcap_reader import InvalidRecording, Recording, read_recording
@@ -298,12 +299,13 @@ def _first_pose(tape: Recording) -> np.ndarray:
     """Returns the pose [7] at which the first robot appears in the recording; without robots, the pose of the first
     person."""
     for kind in ("robot", "human"):
-        such = {
-            sender_of(entry.key)
-            for entry in tape.messages
-            if entry.key.startswith("hello/") and decode_hello(entry.payload).kind == kind
-        }
-        for entry in tape.messages:
-            if entry.key.startswith("a/") and sender_of(entry.key) in such:
-                return decode_pose(entry.payload, "").base_q
+        such = set()
+        for entry in tape.messages.of("hello"):
+            with contextlib.suppress(MessageError):
+                if decode_hello(entry.payload).kind == kind:
+                    such.add(sender_of(entry.key))
+        for entry in tape.messages.of("a") if such else ():
+            if sender_of(entry.key) in such:
+                with contextlib.suppress(MessageError):
+                    return decode_pose(entry.payload, "").base_q
     raise UsageError(f"{tape.path} has no pose of an actor to look from: give --pose X Y YAW")

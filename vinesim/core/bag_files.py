@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import abc
 import contextlib
+import heapq
 import pathlib
 import re
 import sqlite3
@@ -22,16 +23,20 @@ import yaml
 import zstandard
 from mcap.exceptions import EndOfFile
 from mcap.reader import SeekingReader
-from mcap.records import Channel, Message, Schema
-from mcap.stream_reader import StreamReader
+from mcap.records import Channel, Chunk, ChunkIndex, Message, Schema
+
+from vinesim.core import mcap_chunks
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 SQLITE_MAGIC = b"SQLite format 3\0"
 ROS1_MAGIC = b"#ROSBAG V"
 METADATA = "metadata.yaml"
 """File of a rosbag2 folder that names the files of the recording in order."""
-MAX_RECORD = 1 << 31
-"""Largest MCAP record that is read [B]; a damaged length above it ends the reading."""
+MAX_RECORD = 1 << 28
+"""Largest MCAP record that is read, and largest size of an unpacked chunk or message [B]; a larger one ends the
+reading."""
+MAX_FILE = 1 << 36
+"""Largest size to which a compressed file is unpacked on the disk [B]."""
 _KINDS = (".mcap", ".db3")
 
 
@@ -139,7 +144,10 @@ def _open(file: pathlib.Path, is_packed: bool) -> _File:
     if file.suffix in (".zstd", ".zst"):
         stream: IO[bytes] = tempfile.NamedTemporaryFile(prefix="vinesim-bag-")  # noqa: SIM115 (lives as long as the bag)
         with file.open("rb") as packed, contextlib.suppress(zstandard.ZstdError):  # a cut file ends early
-            zstandard.ZstdDecompressor().copy_stream(packed, stream)
+            for part in zstandard.ZstdDecompressor(max_window_size=1 << 27).read_to_iter(packed):
+                stream.write(part)
+                if stream.tell() > MAX_FILE:
+                    raise BagError(f"{file}: unpacks to more than {MAX_FILE >> 30} GiB; unpack it by: zstd -d")
         stream.seek(0)
     else:
         stream = file.open("rb")
@@ -165,15 +173,15 @@ class _File(abc.ABC):
         self.stream = stream
         self.topics: dict[str, Topic] = {}
         self.damage = ""
-        self._unpack = zstandard.ZstdDecompressor() if is_packed else None
+        self._is_packed = is_packed
 
     def messages(self, topics: Collection[str] | None) -> Iterator[BagMessage]:
         """Yield the messages of some topics, or of all, until the end or the first damage, which is noted."""
         count = 0
         try:
             for message in self.read(topics):
-                if self._unpack is not None:
-                    message = message._replace(data=self._unpack.decompressobj().decompress(message.data))
+                if self._is_packed:
+                    message = message._replace(data=mcap_chunks.unpack_zstd(message.data, MAX_RECORD))
                 yield message
                 count += 1
         except GeneratorExit:
@@ -190,6 +198,8 @@ class _McapFile(_File):
     def __init__(self, path: pathlib.Path, stream: IO[bytes], is_packed: bool) -> None:
         super().__init__(path, stream, is_packed)
         self._is_indexed = False
+        self._chunks: list[ChunkIndex] = []
+        self._topic_of: dict[int, str] = {}
         try:
             summary = SeekingReader(stream, record_size_limit=MAX_RECORD).get_summary()
         except Exception:  # the end, which has the summary, is missing or damaged
@@ -197,12 +207,14 @@ class _McapFile(_File):
         statistics = None if summary is None else summary.statistics
         if summary is not None and statistics is not None and (summary.chunk_indexes or not statistics.message_count):
             self._is_indexed = True
+            self._chunks = summary.chunk_indexes
             schemas, channels = summary.schemas, list(summary.channels.values())
         else:
             schemas, channels = self._scan()
         for channel in channels:
             schema = schemas.get(channel.schema_id)
             qos = channel.metadata.get("offered_qos_profiles", "")
+            self._topic_of[channel.id] = channel.topic
             self.topics[channel.topic] = Topic(schema.name if schema else "", channel.message_encoding, qos)
 
     def _scan(self) -> tuple[dict[int, Schema], list[Channel]]:
@@ -217,7 +229,7 @@ class _McapFile(_File):
                     schemas[record.id] = record
                 elif isinstance(record, Channel):
                     channels[record.id] = record
-                count += isinstance(record, Message)
+                count += isinstance(record, mcap_chunks.ChunkMessage)
         except Exception as bad:
             how = "cut off" if isinstance(bad, (EndOfFile, struct.error)) else f"damaged ({_reason(bad)})"
             self.damage = f"{self.path}: is {how} after message {count}"
@@ -225,22 +237,51 @@ class _McapFile(_File):
 
     def _records(self) -> Iterator[Any]:
         self.stream.seek(0)
-        return iter(StreamReader(self.stream, validate_crcs=True, record_size_limit=MAX_RECORD).records)
+        for record in mcap_chunks.records(self.stream, MAX_RECORD):
+            if isinstance(record, Chunk):
+                for _, one in mcap_chunks.records_of(mcap_chunks.unpack(record, MAX_RECORD)):
+                    yield one
+            elif isinstance(record, Message):
+                yield mcap_chunks.ChunkMessage(record.channel_id, record.log_time, record.data)
+            else:
+                yield record
+
+    def _sorted_messages(self) -> Iterator[tuple[int, mcap_chunks.ChunkMessage]]:
+        """Yield all messages of the indexed chunks, sorted by time. Chunks are unpacked when their first message is
+        due."""
+        waiting: list[tuple[int, int, int, mcap_chunks.ChunkMessage | None]] = [
+            (one.message_start_time, one.chunk_start_offset, -1, None) for one in self._chunks
+        ]
+        heapq.heapify(waiting)
+        while waiting:
+            time, chunk, _, message = heapq.heappop(waiting)
+            if message is not None:
+                yield time, message
+                continue
+            self.stream.seek(chunk)
+            record = next(mcap_chunks.records(self.stream, MAX_RECORD, skip_magic=True))
+            if not isinstance(record, Chunk):
+                raise BagError("the index names a chunk that is not there")
+            for place, one in mcap_chunks.records_of(mcap_chunks.unpack(record, MAX_RECORD)):
+                if isinstance(one, mcap_chunks.ChunkMessage):
+                    heapq.heappush(waiting, (one.log_time, chunk, place, one))
 
     def read(self, topics: Collection[str] | None) -> Iterator[BagMessage]:
         if self._is_indexed:
-            self.stream.seek(0)
-            reader = SeekingReader(self.stream, validate_crcs=True, record_size_limit=MAX_RECORD)
-            for _, channel, message in reader.iter_messages(topics=topics):
-                yield BagMessage(channel.topic, message.log_time, message.data)
+            for _, message in self._sorted_messages():
+                topic = self._topic_of[message.channel]
+                if topics is None or topic in topics:
+                    yield BagMessage(topic, message.log_time, message.data)
             return
         names: dict[int, str] = {}
         with contextlib.suppress(Exception):  # the scan has noted the damage
             for record in self._records():
                 if isinstance(record, Channel):
                     names[record.id] = record.topic
-                elif isinstance(record, Message) and (topics is None or names[record.channel_id] in topics):
-                    yield BagMessage(names[record.channel_id], record.log_time, record.data)
+                elif isinstance(record, mcap_chunks.ChunkMessage):
+                    topic = names[record.channel]
+                    if topics is None or topic in topics:
+                        yield BagMessage(topic, record.log_time, record.data)
 
 
 class _SqliteFile(_File):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pathlib
 
+from vinesim.core.errors import one_line
+
 USER_FOLDERS = ("examples", "notebooks", "ros")
 """Names of the folders for users other than ``data``; a wheel contains them in ``vinesim/user_files``."""
 
@@ -26,14 +28,24 @@ def user_folders() -> dict[str, pathlib.Path]:
     return {name: place / name for name in USER_FOLDERS} | {"data": data_dir()}
 
 
+def is_file(path: pathlib.Path) -> bool:
+    """Returns whether there is a file at a path that a user gave; also of a path that no file can have."""
+    try:
+        return path.is_file()
+    except OSError:  # a name that is too long
+        return False
+
+
 def find_data_file(kind: str, name: str, suffix: str) -> pathlib.Path:
     """Returns the path ``name`` if that file exists, else ``data/<kind>/<name><suffix>``. Raises
     :class:`DataFileNotFound` if neither exists."""
     given = pathlib.Path(name)
-    if given.is_file():
+    if is_file(given):
         return given
     shipped = data_dir() / kind / (name if name.endswith(suffix) else name + suffix)
-    if shipped.is_file():
+    if is_file(shipped):
         return shipped
     known = ", ".join(sorted(p.stem for p in (data_dir() / kind).glob(f"*{suffix}"))) or "none"
-    raise DataFileNotFound(f"no file {name!r} and none of that name in data/{kind}; give a path or one of: {known}")
+    raise DataFileNotFound(
+        one_line(f"no file {name!r} and none of that name in data/{kind}; give a path or one of: {known}")
+    )

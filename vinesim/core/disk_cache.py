@@ -6,8 +6,9 @@ computation, its code included.
 The folder is ``$VINESIM_CACHE`` if that is set, else ``vinesim`` in the user's folder for caches: ``$XDG_CACHE_HOME``
 or ``~/.cache``, ``~/Library/Caches`` on macOS, ``%LOCALAPPDATA%`` on Windows. It may be deleted at any time.
 
-When several processes miss the same entry, one makes it and the others wait. A file that is broken, truncated or of
-another version is replaced. If the folder cannot be written, everything is computed without a cache after one warning.
+When several processes miss the same entry, one makes it and the others wait. A file ends with a digest of its name and
+of all its bytes. A file whose digest differs is never read; one line names it, and it is made anew. If the folder
+cannot be written, everything is computed without a cache after one warning.
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ import pathlib
 import sys
 import threading
 import time
-import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from typing import IO
 
@@ -38,6 +38,11 @@ _LEFTOVER_AGE = 3600.0
 """Age above which a temporary file is treated as left over from a killed process [s]."""
 _POLL_PERIOD = 0.02
 """Time between two attempts to get a lock [s]."""
+
+_MARK = b"vscache1"
+"""Format of the files: begins the last bytes of a file, before the digest of its content."""
+_DIGEST_SIZE = 32
+_TAIL_SIZE = len(_MARK) + _DIGEST_SIZE
 
 Arrays = dict[str, np.ndarray]
 
@@ -79,7 +84,7 @@ def load_or_make(name: str, digest: str, make: Callable[[], Mapping[str, np.ndar
     if (found := _read(path)) is not None:
         return found
     with exclusive(path.stem):
-        if (found := _read(path)) is not None:  # another process has made it meanwhile
+        if (found := _read(path, logging.DEBUG)) is not None:  # another process has made it meanwhile
             return found
         arrays = dict(make())
         _write(path, arrays)
@@ -107,9 +112,10 @@ def source_digest(*sources: pathlib.Path | str | bytes) -> str:
     """Returns a digest (16 hex digits) of files, of all ``*.py`` and ``*.toml`` files below folders, of texts and
     bytes.
 
-    The digest includes the version of NumPy, because results may differ in the last bit between versions.
+    The digest includes the format of the cache's files, and the version of NumPy, because results may differ in the
+    last bit between versions.
     """
-    h = hashlib.blake2b(np.__version__.encode(), digest_size=8)
+    h = hashlib.blake2b(_MARK + np.__version__.encode(), digest_size=8)
     for source in sources:
         if isinstance(source, pathlib.Path):
             files = [source]
@@ -130,19 +136,39 @@ def _warn(error: Exception) -> None:
         log.warning("no cache on disk, so every start computes its tables again (set VINESIM_CACHE): %s", error)
 
 
-def _read(path: pathlib.Path) -> Arrays | None:
-    """Returns the arrays of a file; None if the file is missing or broken."""
+def _read(path: pathlib.Path, level: int = logging.WARNING) -> Arrays | None:
+    """Returns the arrays of a file; None if the file is missing or broken. One line of this ``level`` names a broken
+    file."""
     try:
-        with np.load(path, allow_pickle=False) as data:
-            arrays = {name: data[name] for name in data.files}  # reading checks the checksums
-    except FileNotFoundError:
+        with open(path, "rb") as file:
+            end = file.seek(0, os.SEEK_END) - _TAIL_SIZE
+            if end < 0:
+                raise ValueError("it is cut off")
+            file.seek(end)
+            tail = file.read(_TAIL_SIZE)
+            file.seek(0)
+            if tail != _tail(path.stem, file, end):
+                raise ValueError("its content does not fit its digest")
+            file.seek(0)
+            with np.load(file, allow_pickle=False) as data:
+                arrays = {name: data[name] for name in data.files}
+    except (FileNotFoundError, NotADirectoryError):
         return None
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, NotImplementedError) as error:
-        log.info("%s is broken and will be replaced: %s", path, error)
+    except Exception as error:  # a file that another version of NumPy wrote can raise anything
+        log.log(level, "%s is broken and is made anew: %s", path, " ".join(str(error).split()) or type(error).__name__)
         return None
     with contextlib.suppress(OSError):
         os.utime(path)  # the time of last use, for _prune
     return arrays
+
+
+def _tail(stem: str, file: IO[bytes], length: int) -> bytes:
+    """Returns what follows the next ``length`` bytes of a file whose name without suffix is ``stem``."""
+    digest = hashlib.blake2b(stem.encode() + b"\0", digest_size=_DIGEST_SIZE)
+    while length > 0 and (block := file.read(min(length, 1 << 20))):
+        digest.update(block)
+        length -= len(block)
+    return _MARK + digest.digest()
 
 
 def _write(path: pathlib.Path, arrays: Arrays) -> None:
@@ -153,8 +179,13 @@ def _write(path: pathlib.Path, arrays: Arrays) -> None:
     try:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with open(draft, "wb") as file:
+            with open(draft, "w+b") as file:
                 np.savez(file, **arrays)  # pyright: ignore[reportArgumentType] the stub of savez takes bools only
+                end = file.seek(0, os.SEEK_END)
+                file.seek(0)
+                tail = _tail(path.stem, file, end)
+                file.seek(end)
+                file.write(tail)
             os.replace(draft, path)
         except BaseException:
             with contextlib.suppress(OSError):

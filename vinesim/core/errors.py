@@ -9,6 +9,16 @@ import pathlib
 from collections.abc import Iterator
 from typing import SupportsIndex
 
+MAX_LINE = 1000
+"""Largest number of letters of a message about a file; a file may contain words of any length."""
+
+
+def one_line(text: str) -> str:
+    """Returns a text in one line of at most :data:`MAX_LINE` letters. The middle of a longer text is left out, because
+    the place stands at its beginning and the remedy at its end."""
+    line = " ".join(text.splitlines())
+    return line if len(line) <= MAX_LINE else f"{line[: MAX_LINE - 305]} ... {line[-300:]}"
+
 
 class UsageError(ValueError):
     """A command or an API was called with arguments that contradict each other or are out of range.

@@ -13,6 +13,8 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from vinesim.core.errors import one_line
+
 T = TypeVar("T", bound=msgspec.Struct)
 
 _KINDS = {
@@ -24,8 +26,22 @@ _KINDS = {
 }
 
 
+MAX_SIZE = 4 << 20
+"""Largest size of a TOML file [B]. The largest imported plant has 1 MB."""
+MAX_DEPTH = 50
+"""Largest depth of nested tables and lists."""
+_DEEP_KEY = re.compile(
+    rf"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){{{MAX_DEPTH},}}"""  # tomllib takes minutes for one
+)
+_MAX_SHOWN = 200
+"""Largest number of characters of a value or of an error that a message repeats."""
+
+
 class DataError(ValueError):
     """Raised for a data file that cannot be used. The message is one line."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(one_line(message))
 
 
 def load_toml(path: pathlib.Path, kind: type[T], error: type[DataError] = DataError) -> T:
@@ -38,14 +54,27 @@ def read_toml(path: pathlib.Path, error: type[DataError] = DataError) -> dict[st
     """Returns the tables of the TOML file at ``path``. Raises ``error`` if the file cannot be read or has a number that
     is not finite."""
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except tomllib.TOMLDecodeError as bad:
-        raise error(f"{path}: not valid TOML: {_one_line(bad)}; correct the syntax there") from None
+        with path.open("rb") as file:
+            content = file.read(MAX_SIZE + 1)
+        if len(content) > MAX_SIZE:
+            raise error(f"{path}: has more than {MAX_SIZE >> 20} MiB; give a smaller file")
+        text = content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except (OSError, UnicodeDecodeError) as bad:
         raise error(f"{path}: cannot be read: {_one_line(bad)}; give a readable UTF-8 file") from None
-    for place, value in _leaves(data):
+    try:
+        if _DEEP_KEY.search(text):
+            raise RecursionError
+        data = tomllib.loads(text)
+        leaves = _leaves(data)
+    except RecursionError:
+        raise error(f"{path}: nests tables or lists more than {MAX_DEPTH} deep; nest fewer") from None
+    except ValueError as bad:  # tomllib.TOMLDecodeError, and a number with more digits than Python reads
+        raise error(f"{path}: not valid TOML: {_one_line(bad)}; correct the syntax there") from None
+    for place, value in leaves:
         if isinstance(value, float) and not math.isfinite(value):
-            raise error(f"{path}: {place} is {value}; give a finite number")
+            raise error(f"{path}: {_shown(place)} is {value}; give a finite number")
+        if isinstance(value, int) and not -(1 << 63) <= value < 1 << 63:
+            raise error(f"{path}: {_shown(place)} has more than 64 bits; give a smaller number")
     return data
 
 
@@ -55,7 +84,11 @@ def to_struct(data: dict[str, Any], kind: type[T], source: str, error: type[Data
     try:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as bad:
-        raise error(f"{source}: {_explain(str(bad), data, kind)}") from None
+        try:
+            told = _explain(str(bad), data, kind)
+        except (LookupError, StopIteration, TypeError, AttributeError, ValueError):  # a key has marks of msgspec's text
+            told = _shown(str(bad))
+        raise error(f"{source}: {_one_line(told)}") from None
 
 
 @functools.cache
@@ -78,16 +111,28 @@ def _remedy(name: str, known: list[str], hint: str = "") -> str:
     return f"{hint} (known: {', '.join(known)})"
 
 
-def _one_line(bad: Exception) -> str:
+def _one_line(bad: object) -> str:
     return " ".join(str(bad).split())
 
 
-def _leaves(data: Any, place: str = "") -> list[tuple[str, Any]]:
-    """Returns every value in nested tables and lists, with its path, for example ``spawns[0].x``."""
+def _shown(text: str) -> str:
+    """Returns the beginning of a text, which may be as long as a file."""
+    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
+
+
+def _leaves(data: Any, place: str = "", depth: int = 0) -> list[tuple[str, Any]]:
+    """Returns every value in nested tables and lists, with its path, for example ``spawns[0].x``. Raises
+    :class:`RecursionError` beyond :data:`MAX_DEPTH`."""
+    if depth > MAX_DEPTH:
+        raise RecursionError
     if isinstance(data, dict):
-        return [leaf for key, value in data.items() for leaf in _leaves(value, f"{place}.{key}" if place else key)]
+        return [
+            leaf
+            for key, value in data.items()
+            for leaf in _leaves(value, f"{place}.{key}" if place else key, depth + 1)
+        ]
     if isinstance(data, list):
-        return [leaf for i, value in enumerate(data) for leaf in _leaves(value, f"{place}[{i}]")]
+        return [leaf for i, value in enumerate(data) for leaf in _leaves(value, f"{place}[{i}]", depth + 1)]
     return [(place, data)]
 
 
@@ -114,12 +159,12 @@ def _explain(message: str, data: Any, kind: Any) -> str:
         return what
     place = place or "the file"
     if what.startswith("Invalid enum value"):
-        return f"{place} is {found!r}; give one of: {', '.join(_choices(kind, steps))}"
+        return f"{place} is {_shown(repr(found))}; give one of: {', '.join(_choices(kind, steps))}"
     if what.startswith("Expected") and quoted:
         types = [_KINDS.get(t.strip(), t.strip()) for t in re.split(r"\|", quoted[0])]
         bound = what.split("`", 2)[2].partition(", got")[0].strip()
-        return f"{place} is {found!r}; give {' or '.join(types)}{' ' + bound if bound else ''}"
-    return f"{place} is {found!r}; {what}"
+        return f"{place} is {_shown(repr(found))}; give {' or '.join(types)}{' ' + bound if bound else ''}"
+    return f"{place} is {_shown(repr(found))}; {what}"
 
 
 def _step_in(kind: Any, steps: list[Any]) -> Any:

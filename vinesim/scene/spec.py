@@ -17,11 +17,11 @@ import msgspec
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from vinesim.core.data_files import DataFileNotFound, find_data_file
+from vinesim.core.data_files import DataFileNotFound, find_data_file, is_file
 from vinesim.core.geodesy import APRILIA, Geodetic
 from vinesim.core.numbers import is_whole
 from vinesim.core.toml_loader import DataError, load_toml
-from vinesim.scene import plant_parameters
+from vinesim.scene import plant_parameters, scene_limits
 from vinesim.scene.berries import VARIETIES
 from vinesim.scene.palette import PaletteTable, resolve
 from vinesim.scene.physics_parameters import PhysicsParameters
@@ -335,12 +335,14 @@ def check_scene(scene: Scene, source: str) -> Scene:
 def _beside(scene: pathlib.Path, file: str) -> pathlib.Path:
     """Returns the path of a file that a scene names: in the scene's folder if the file exists there, else ``file``
     unchanged."""
-    return near if (near := scene.parent / file).is_file() else pathlib.Path(file)
+    return near if is_file(near := scene.parent / file) else pathlib.Path(file)
 
 
 def _find_error(scene: Scene) -> str:
     """Check rules that the types cannot express. Returns a message with field, error and correction; empty if the scene
     is valid."""
+    if excess := scene_limits.find_excess(msgspec.to_builtins(scene)):
+        return excess
     low, high = scene.fruit.bunches
     if not 0 <= low <= high:
         return f"fruit.bunches is [{low}, {high}]; give [fewest, most] with 0 <= fewest <= most"
@@ -436,6 +438,8 @@ def on_its_date(scene: Scene) -> Scene:
 
 MAX_NODES = 1_000_000
 """Largest number of nodes of uneven ground."""
+MAX_PIXELS = 4_000_000
+"""Largest number of pixels of an image of heights."""
 MAX_SIDE_SLOPE = 1.0
 """[1] Steepest side of a rut, 45 degrees. GUESSED: moist soil slides off steeper sides."""
 _RUT_STEEPNESS = 8.0 / (3.0 * math.sqrt(3.0))
@@ -496,8 +500,14 @@ def load_heights(table: TerrainTable) -> np.ndarray:
     try:
         with Image.open(str(path)) as image:
             mode = image.mode
+            if image.width * image.height > MAX_PIXELS:
+                raise SceneError(
+                    f"terrain.image is {path!r} with {image.width} x {image.height} pixels; give at most {MAX_PIXELS}"
+                )
             pixels = np.asarray(image)
-    except (OSError, UnidentifiedImageError, ValueError):
+    except SceneError:
+        raise
+    except (OSError, UnidentifiedImageError, ValueError, SyntaxError, Image.DecompressionBombError):
         raise SceneError(f"terrain.image is {path!r}, which cannot be read; give a grey PNG of 8 or 16 bits") from None
     if pixels.ndim != 2 or mode not in ("L", "I;16", "I;16B", "I") or min(pixels.shape) < 2:
         raise SceneError(
@@ -527,6 +537,6 @@ def with_seed(scene: Scene, seed: int | None) -> Scene:
     """Returns a copy of the scene with the given seed; None keeps the scene's own seed."""
     if seed is None:
         return scene
-    if not is_whole(seed) or seed < 0:
-        raise SceneError(f"seed is {seed}: give a whole number of 0 or more")
+    if not is_whole(seed) or not 0 <= seed <= scene_limits.MAX_SEED:
+        raise SceneError(f"seed is {seed}: give a whole number of 0 to {scene_limits.MAX_SEED}")
     return msgspec.structs.replace(scene, seed=seed)

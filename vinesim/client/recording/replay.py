@@ -13,10 +13,11 @@ the same messages in the same step in every replay. On a network, messages get n
 
 from __future__ import annotations
 
-import bisect
 import logging
 import time
 from collections.abc import Callable, Iterable
+
+import numpy as np
 
 from vinesim.audio.hearing import SpectatorsSpeakTo
 from vinesim.net.codec.control import (
@@ -42,6 +43,10 @@ MAX_REPLY = 4096
 """Largest size of a reply with retained records [B]; larger replies are split."""
 
 
+_APPLIED = ("live", "hello", "fact")
+"""Families of keys whose messages change the state of a :class:`Playhead`."""
+
+
 class Playhead:
     """A position in a recording, with the actors and the retained state at that position."""
 
@@ -58,14 +63,12 @@ class Playhead:
         to query it."""
         self.records = RetainedState()
         """Retained records of all objects at the present position in the recording."""
-        for entry in reversed(recording.messages):
-            if entry.key.startswith("hello/"):
-                self.greetings[sender_of(entry.key)] = entry.payload
+        for entry in recording.messages.of("hello"):
+            self.greetings.setdefault(sender_of(entry.key), entry.payload)
         self._load_initial_records()
-        self._next = bisect.bisect_left(recording.messages, self.time, key=lambda entry: entry.time)
-        for entry in recording.messages[
-            : bisect.bisect_right(recording.messages, self.time, key=lambda entry: entry.time)
-        ]:
+        times = recording.messages.times
+        self._next = int(np.searchsorted(times, self.time, "left"))
+        for entry in recording.messages.of(*_APPLIED, last=int(np.searchsorted(times, self.time, "right"))):
             self._apply(entry)
 
     @property
@@ -78,22 +81,17 @@ class Playhead:
         end."""
         first = self._next
         self.time = max(self.time, min(until, self.end))
-        while self._next < len(self.recording.messages) and self.recording.messages[self._next].time <= self.time:
-            self._apply(self.recording.messages[self._next])
-            self._next += 1
-        return self.recording.messages[first : self._next]
+        self._next = max(first, int(np.searchsorted(self.recording.messages.times, self.time, "right")))
+        entries = self.recording.messages[first : self._next]
+        for entry in entries:
+            self._apply(entry)
+        return entries
 
     def _load_initial_records(self) -> None:
         """Load the server's state at the beginning of the recording: its replies without records published later."""
-        said = {
-            record
-            for entry in self.recording.messages
-            if entry.key.startswith("fact/")
-            for record in _decode_records(entry.payload)
-        }
-        for entry in self.recording.messages:
-            if entry.key.startswith("snap/"):
-                self._merge(entry.key, (record for record in _decode_records(entry.payload) if record not in said))
+        said = {record for entry in self.recording.messages.of("fact") for record in _decode_records(entry.payload)}
+        for entry in self.recording.messages.of("snap"):
+            self._merge(entry.key, (record for record in _decode_records(entry.payload) if record not in said))
 
     def _apply(self, entry: RecordedMessage) -> None:
         family, _, name = entry.key.partition("/")
@@ -326,7 +324,7 @@ class Replay:
             (_record_key(cell, record), encode_records([record])) for cell, record in self.playhead.records
         ]
         self._keys: dict[str, list[str]] = {}
-        for key in sorted({entry.key for entry in recording.messages if family_of(entry.key).is_published}):
+        for key in sorted(key for key in recording.messages.keys if family_of(key).is_published):
             self._keys.setdefault(sender_of(key), []).append(key)
 
     @property

@@ -8,6 +8,7 @@ remain, and at most the last frame is torn.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import pathlib
@@ -107,7 +108,13 @@ class Journal:
             raise JournalError(f"{path}: {reason}, so its world is unknown: move it away, or give another --state-dir")
         if valid_end < len(content):
             backup = _free_name(path)
-            _write(backup, content)
+            try:
+                _write(backup, content)
+            except OSError as error:
+                raise JournalError(
+                    f"{path}: torn after {valid_end} of {len(content)} bytes, and its backup {backup.name} cannot be "
+                    f"written ({error.strerror}), so it is left as it is: make room or give another --state-dir"
+                ) from error
             log.warning(
                 "%s: torn after %d of %d bytes; the %d facts before that are used, the original file is kept as %s",
                 path,
@@ -176,8 +183,8 @@ def load_all(folder: pathlib.Path) -> dict[str, Journal]:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for rest in folder.glob(f"*{SUFFIX}.part"):
-            rest.unlink()  # unfinished new journal: the old file is still there
+        for rest in (*folder.glob(f"*{SUFFIX}.part"), *folder.glob(f"*{SUFFIX}.torn-*.part")):
+            rest.unlink()  # unfinished new journal or backup: the old file is still there
     except OSError as error:
         raise _cannot_write(folder, error) from error
     journals: dict[str, Journal] = {}
@@ -212,11 +219,16 @@ def _packed(record: bytes) -> bytes:
 def _write(path: pathlib.Path, content: bytes) -> None:
     """Write a file atomically: it has the old content or the new one at any moment."""
     part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
+    try:
+        with part.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)  # on a full disk it takes the room that others need
+        raise
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)

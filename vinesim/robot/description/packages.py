@@ -6,8 +6,10 @@ above the robot file, then among installed wheels.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib.util
+import logging
 import os
 import pathlib
 import re
@@ -19,6 +21,8 @@ from collections.abc import Iterator
 
 from vinesim.core import disk_cache
 from vinesim.scene.triangles import digest_of
+
+log = logging.getLogger(__name__)
 
 MODEL_PATHS = ("GZ_SIM_RESOURCE_PATH", "IGN_GAZEBO_RESOURCE_PATH", "GAZEBO_MODEL_PATH", "SDF_PATH")
 """Environment variables with the folders in which Gazebo searches ``model://``."""
@@ -154,17 +158,22 @@ def _download(uri: str) -> pathlib.Path | None:
     """Returns a file of a server, from the cache if it has it; None if the server does not give it."""
     suffix = pathlib.PurePosixPath(urllib.parse.urlsplit(uri).path).suffix
     kept = disk_cache.folder() / "downloads" / f"{digest_of(uri.encode())}{suffix}"
+    digest = kept.with_name(f"{kept.name}.digest")
     if kept.is_file():
-        return kept
+        with contextlib.suppress(OSError):
+            if digest.read_text("ascii", "replace") == digest_of(kept.read_bytes()):
+                return kept
+        log.warning("%s is broken and is downloaded anew", kept)
     try:
         with urllib.request.urlopen(uri, timeout=DOWNLOAD_TIMEOUT) as answer:
             content = answer.read(MAX_DOWNLOAD + 1)
         if len(content) > MAX_DOWNLOAD:
             return None
         kept.parent.mkdir(parents=True, exist_ok=True)
-        part = kept.with_name(f"{kept.name}.{os.getpid()}")
-        part.write_bytes(content)
-        part.replace(kept)
+        for file, written in ((kept, content), (digest, digest_of(content).encode())):
+            part = file.with_name(f"{file.name}.{os.getpid()}")
+            part.write_bytes(written)
+            part.replace(file)
     except (OSError, urllib.error.URLError, ValueError):
         return None
     return kept

@@ -99,6 +99,8 @@ def repair_joints(root: etree._Element, assumed: list[str]) -> None:
     filled = []
     unbounded = []
     for name, joint in moving.items():
+        for more in joint.findall("mimic")[1:]:
+            joint.remove(more)
         mimic = joint.find("mimic")
         if mimic is not None and mimic.get("joint") not in moving:
             joint.remove(mimic)

@@ -14,8 +14,9 @@ from typing import Literal, cast
 import msgspec
 import numpy as np
 
+from vinesim.core.toml_loader import DataError, read_toml
 from vinesim.robot.description.grippers import AnyGripper, Cutter
-from vinesim.robot.description.urdf import description_error
+from vinesim.robot.description.urdf import DescriptionError, description_error
 from vinesim.scene.values import SENSOR_KINDS, ImuMount, RenderedMount, SensorMode, SensorMount, SensorPacing
 
 BaseKind = Literal["auto", "planar", "free", "fixed"]
@@ -155,8 +156,10 @@ def read_sidecar(file: pathlib.Path) -> Sidecar:
     if not file.is_file():
         return Sidecar()
     try:
-        return msgspec.toml.decode(file.read_bytes(), type=SidecarFile)
-    except (msgspec.DecodeError, msgspec.ValidationError) as error:
+        return msgspec.convert(read_toml(file), SidecarFile)
+    except DataError as error:
+        raise DescriptionError(str(error)) from None
+    except msgspec.ValidationError as error:
         raise description_error(file, str(error), "see data/robots/vinebot.toml for all keys") from error
 
 

@@ -16,6 +16,8 @@ from collections.abc import Mapping
 import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
+from vinesim.core.errors import one_line
+
 MOVABLE_JOINT_TYPES = ("revolute", "continuous", "prismatic")
 """Types of URDF joints that move about or along one axis."""
 
@@ -61,7 +63,7 @@ class DescriptionError(ValueError):
 
 def description_error(file: pathlib.Path, problem: str, remedy: str) -> DescriptionError:
     """Returns an error to raise, with a message in one line."""
-    return DescriptionError(" ".join(f"{file}: {problem}; {remedy}".split()))
+    return DescriptionError(one_line(" ".join(f"{file}: {problem}; {remedy}".split())))
 
 
 # ------------------------------------------------------------------ the file as XML

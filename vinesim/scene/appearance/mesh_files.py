@@ -94,7 +94,7 @@ def read_colored(file: pathlib.Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Returns the corners [face, 3, 3] m, float32, of a mesh file, and the colour [face, 4] of each face, 0 to 255;
     None if the file has no colours. Raises the errors of the file's format if it is unreadable."""
     digest = hashlib.blake2b(f"{file}|{file.stat().st_mtime_ns}|".encode() + file.read_bytes(), digest_size=20)
-    found = disk_cache.load_or_make(CACHE_NAME, digest.hexdigest(), lambda: _read_file(file))
+    found = disk_cache.load_or_make(CACHE_NAME, disk_cache.source_digest(digest.digest()), lambda: _read_file(file))
     return found["corners"], found["colors"] if len(found["colors"]) else None
 
 
@@ -169,7 +169,7 @@ def is_binary_stl(file: str | pathlib.Path) -> bool:
 
 
 def _write(file: pathlib.Path, content: bytes) -> pathlib.Path:
-    if not file.is_file() or file.stat().st_size != len(content):
+    if not file.is_file() or file.read_bytes() != content:
         file.parent.mkdir(parents=True, exist_ok=True)
         part = file.with_name(f"{file.name}.{os.getpid()}")
         part.write_bytes(content)

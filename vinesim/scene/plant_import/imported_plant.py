@@ -14,6 +14,7 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 
+from vinesim.core.data_files import is_file
 from vinesim.core.errors import UsageError, writing
 from vinesim.core.toml_loader import load_toml
 from vinesim.scene import plant_parameters
@@ -203,7 +204,8 @@ def _fill_diameters(skeleton: Skeleton, plants: str) -> tuple[np.ndarray, np.nda
         below = parent[node]
         over = above[node]
         if below >= 0 and over >= 0:
-            share = (way[node] - way[below]) / (way[over] - way[below])
+            length = way[over] - way[below]
+            share = (way[node] - way[below]) / length if length > 0.0 else 0.0
             diameter[node] = diameter[below] + share * (diameter[over] - diameter[below])
         elif over >= 0:
             diameter[node] = diameter[over]
@@ -216,7 +218,7 @@ def _fill_diameters(skeleton: Skeleton, plants: str) -> tuple[np.ndarray, np.nda
 def load_imported_plant(path: str) -> ImportedPlant:
     """Returns the imported plant in a TOML file. Raises :class:`PlantFileError` if the file cannot be used."""
     file = pathlib.Path(path)
-    if not file.is_file():
+    if not is_file(file):
         raise PlantFileError(f"{file}: no such file; write it with: vinesim scene import-plant")
     plant = load_toml(file, ImportedPlant, PlantFileError)
     for node, _ in plant.bunches:

@@ -20,7 +20,7 @@ from vinesim.core.text_files import CUT, NumberReader, TextError, is_cut
 from vinesim.scene.plant_import.skeleton import PlantFileError, Skeleton, read_plant, sort_nodes
 
 _SECTIONS = ("CODE", "CLASSES", "DESCRIPTION", "FEATURES", "MTG")
-_STEP = re.compile(r"(\^|/|<<|<|\+\+|\+)([A-Za-z]+)?(\d+)?")
+_STEP = re.compile(r"(\^|/|<<|<|\+\+|\+)([A-Za-z]+)?(\d{1,9})?")
 _DIAMETERS = {"diameter": 1.0, "diam": 1.0, "topdia": 1.0, "radius": 2.0}
 """Features (in lower case) that contain the thickness of wood, with the factor that converts them to a diameter."""
 _AXES = ("xx", "yy", "zz")
@@ -176,7 +176,7 @@ def _steps(place: str, code: str) -> list[tuple[str, int]]:
             )
         found.append((match[1], int(match[3] or 0)))
         at = match.end()
-    if found == [("^", 0)]:
+    if found[0][0] == "^" and len(found) == 1:
         raise PlantFileError(f"{place}: '^' continues with nothing; give an entity behind it")
     return found
 

@@ -90,7 +90,7 @@ def read_ply(path: pathlib.Path, unit: float, diameter_unit: float) -> Skeleton:
 
 def _whole(path: pathlib.Path, name: str, values: np.ndarray) -> np.ndarray:
     """Returns numbers of vertices as int. Raises :class:`PlantFileError` if one is not whole."""
-    if (bad := values != np.floor(values)).any():
+    if (bad := ~((np.abs(values) < 1 << 31) & (values == np.floor(values)))).any():
         raise PlantFileError(f"{path}: {name} is {values[np.argmax(bad)]:g}; give the number of a vertex, from 0")
     return values.astype(int)
 
@@ -212,7 +212,7 @@ def _head(path: pathlib.Path, head: str) -> tuple[str, list[_Element]]:
             continue
         if words[0] == "format" and len(words) == 3 and words[1] in _ORDERS:
             form = words[1]
-        elif words[0] == "element" and len(words) == 3 and words[2].isdecimal():
+        elif words[0] == "element" and len(words) == 3 and re.fullmatch("[0-9]{1,9}", words[2]):
             elements.append(_Element(words[1].lower(), int(words[2])))
         elif words[0] == "property" and elements and len(words) == 3 and words[1] in _TYPES:
             elements[-1].properties.append(_Property(_name(words[2]), _TYPES[words[1]]))
@@ -238,7 +238,10 @@ def _name(text: str) -> str:
 
 def _read_ascii(path: pathlib.Path, body: bytes, elements: list[_Element], line: int) -> _Content:
     """``line``: number of the first line of the body."""
-    text = decode_text(body)
+    try:
+        text = decode_text(body)
+    except TextError as bad:
+        raise PlantFileError(f"{path}: its rows: {bad}") from None
     lines = [(number, row.split()) for number, row in enumerate(text.split("\n"), line) if row.strip()]
     is_plain = re.fullmatch(r"[0-9eE.+\-\s]*", text) is not None
     numbers = NumberReader()
@@ -294,13 +297,16 @@ def _read_binary(
     for element in elements:
         if needed <= tables.keys():
             break
+        if not element.properties:
+            continue
         single = [each for each in element.properties if not each.count]
         if len(single) == len(element.properties):
             kind = np.dtype([(each.name, order + each.kind) for each in single])
             if at + element.count * kind.itemsize > len(body):
                 raise _short(path, element)
             table = np.frombuffer(body, kind, element.count, at)
-            tables[element.name] = {each.name: table[each.name].astype(float) for each in single}
+            with np.errstate(invalid="ignore"):  # some bits are signalling NaNs
+                tables[element.name] = {each.name: table[each.name].astype(float) for each in single}
             at += element.count * kind.itemsize
             continue
         columns: dict[str, list[float]] = {each.name: [] for each in single}

@@ -12,6 +12,8 @@ from vinesim.core.toml_loader import DataError
 
 MAX_NODES = 20_000
 """Largest number of points of one plant."""
+MIN_DIAMETER = 1e-5
+"""[m] Smallest diameter of wood; a thinner one is an error of its unit."""
 MAX_HEIGHT = 30.0
 """[m] Largest distance of a plant's points from its base. A larger plant is refused, because its unit of length must be
 wrong."""
@@ -60,17 +62,20 @@ def check_skeleton(path: pathlib.Path, skeleton: Skeleton) -> Skeleton:
         raise PlantFileError(
             f"{path}: point {_first(np.asarray(~np.isfinite(skeleton.position).all(1)))} is not finite; mend it"
         )
-    size = float(np.linalg.norm(skeleton.position - skeleton.position[0], axis=1).max())
+    with np.errstate(over="ignore"):
+        size = float(np.linalg.norm(skeleton.position - skeleton.position[0], axis=1).max())
     if not 0.0 < size <= MAX_HEIGHT:
         raise PlantFileError(
             f"{path}: reaches {size:.4g} m from its base; give the unit of its lengths (m, cm or mm), at most "
             f"{MAX_HEIGHT:.0f} m"
         )
     known = ~np.isnan(skeleton.diameter)
-    if (bad := known & ~((skeleton.diameter > 0.0) & (skeleton.diameter <= 1.0))).any():
+    if (bad := known & ~((skeleton.diameter >= MIN_DIAMETER) & (skeleton.diameter <= 1.0))).any():
         node = _first(bad)
         size = skeleton.diameter[node]
-        remedy = "give the unit of diameters, up to 1 m" if size > 1.0 else "give one above 0, or 0 where it is unknown"
+        remedy = f"give {MIN_DIAMETER:g} m or more, or 0 where it is unknown"
+        if size > 1.0:
+            remedy = "give the unit of diameters, up to 1 m"
         raise PlantFileError(f"{path}: diameter of point {node} is {size:.4g} m; {remedy}")
     if (bad := ~((skeleton.bunch >= 0.0) & (skeleton.bunch <= 5.0))).any():
         node = _first(bad)
