@@ -36,20 +36,31 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def overlaps_leaf(
-    low: wp.vec3, high: wp.vec3, tree: int, dt: float, capsules: Capsules, leaves: Leaves, bodies: PlantBodies
+def has_leaf_near(
+    tree: int,
+    first: int,
+    end: int,
+    actor_low: wp.vec3,
+    actor_high: wp.vec3,
+    dt: float,
+    capsules: Capsules,
+    leaves: Leaves,
+    bodies: PlantBodies,
+    geom_states: GeomStates,
 ):
-    """Returns whether a box overlaps the box of one of a tree's leaves."""
-    overlaps = bool(False)
+    """Returns whether the box of one of a tree's leaves overlaps that of a geom from ``first`` to before ``end``, which
+    all lie in the box ``actor_low``, ``actor_high``."""
+    is_near = bool(False)
     s = leaves.tree_start[tree]
     last = leaves.tree_start[tree + 1]
     while s < last:
-        _start, _end, _speed, leaf_low, leaf_high = sweep_capsule(s, dt, capsules, bodies)
+        _start, _end, _speed, low, high = sweep_capsule(s, dt, capsules, bodies)
         s = s + 1
-        if not aabbs_disjoint(low, high, leaf_low, leaf_high):
-            overlaps = True
-            s = last
-    return overlaps
+        if not aabbs_disjoint(low, high, actor_low, actor_high):
+            if next_overlap(first, end, low, high, geom_states.low, geom_states.high) < end:
+                is_near = True
+                s = last
+    return is_near
 
 
 @wp.kernel
@@ -87,25 +98,23 @@ def mark_trees_with_near_leaves(
                 high = tree_boxes.high[tree] + grown
                 counts = trees.is_remote[tree] or not actors.is_remote[actor]
                 if counts and not is_near_out[tree] and not aabbs_disjoint(low, high, actor_low, actor_high):
-                    g = int(actors.start[actor])
                     end = actors.start[actor + 1]
-                    g = next_overlap(g, end, low, high, geom_states.low, geom_states.high)
-                    while g < end:
-                        if overlaps_leaf(
-                            geom_states.low[g],
-                            geom_states.high[g],
-                            tree,
-                            wp.float32(parameters.dt),
-                            capsules,
-                            leaves,
-                            bodies,
-                        ):
-                            if not trees.is_awake[tree]:
-                                wp.atomic_add(counters_out, NEAR_ASLEEP, 1)
-                            is_near_out[tree] = True
-                            g = end
-                        else:
-                            g = next_overlap(g + 1, end, low, high, geom_states.low, geom_states.high)
+                    first = next_overlap(actors.start[actor], end, low, high, geom_states.low, geom_states.high)
+                    if first < end and has_leaf_near(
+                        tree,
+                        first,
+                        end,
+                        actor_low,
+                        actor_high,
+                        wp.float32(parameters.dt),
+                        capsules,
+                        leaves,
+                        bodies,
+                        geom_states,
+                    ):
+                        if not trees.is_awake[tree]:
+                            wp.atomic_add(counters_out, NEAR_ASLEEP, 1)
+                        is_near_out[tree] = True
 
 
 @wp.func
