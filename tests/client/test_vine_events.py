@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from tests.physics.test_cut_canes import level_cane
 from tests.physics.test_cutting import close, on_cane
 from tests.support.contact_scenes import bar, bunch_scene
 from vinesim.client.vine_events import events_of, fruit_report
@@ -42,3 +43,21 @@ def test_a_cut_a_fall_and_the_lost_berries_are_events_and_in_the_report():
     assert (bunch["bunch"], bunch["drops"], bunch["berries"]) == (0, 1, report["berries"])
     assert bunch["damage"] == pytest.approx((report["berries_burst"] + report["berries_lost"]) / 80)
     assert kinds.count(("fruit", "lost")) >= 1
+
+
+def test_wood_and_ties_that_give_are_events():
+    """A cane is pressed until it cracks: the row has the moment of the crack, and its place from the base."""
+    model = level_cane(shape="equilibrium", strength=50e6, yield_strength=40e6, toughness=2e4)
+    physics = Physics(model)
+    tip = len(model.body_mass) - 3
+    rows = []
+    for _ in range(400):
+        physics.plants.body_load[tip, 2] -= 0.5
+        physics.plants.wake(0)
+        physics.step()
+        rows += json.loads(json.dumps(events_of(physics)))
+        if rows:
+            break
+    assert (rows[0]["event"], rows[0]["cause"], rows[0]["tie"]) == ("crack", "bend", -1)
+    assert np.linalg.norm(rows[0]["moment"]) == pytest.approx(physics.detachment_monitor.wood.law.breaks[0], rel=0.1)
+    assert rows[0]["place_m"] == pytest.approx(0.1 * rows[0]["body"])

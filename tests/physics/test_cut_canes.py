@@ -134,11 +134,12 @@ def test_a_thousand_random_cuts_keep_mass_centre_inertia_and_momentum(scene):
     cut_at_random(scene, 167, seed=11)
 
 
-def level_cane(**fields: object) -> Model:
-    """A straight cane of 1 m in 10 segments that points along x, with spare bodies."""
+def level_cane(spares: int = 2, **fields: object) -> Model:
+    """A straight cane of 1 m in 10 segments that points along x, with ``spares`` spare bodies."""
     usual = {"length": 1.0, "radius": 0.004, "youngs_modulus": 5e9, "density": 800.0, "segments": 10, "shape": "slack"}
     pose = np.array([0.0, 0.0, 1.5, 0.0, 0.0, 0.0, 1.0])
-    return with_spares(CaneBuilder(**{**usual, "pose": pose, **fields}).build())
+    model = CaneBuilder(**{**usual, "pose": pose, **fields}).build()
+    return with_spares(model, spares) if spares else model
 
 
 def first_frequency(plants: ArticulationSolver, bodies: list[int]) -> float:
@@ -238,6 +239,16 @@ def test_a_blade_that_closes_twice_cuts_once():
     assert physics.detachments == ()
 
 
+def test_a_blade_leaves_a_fallen_piece_whole_if_no_spare_is_left():
+    """The first cut is at the joint. The piece in the mouth has no joint any more, and cannot be split."""
+    physics = cut_by_blade(level_cane(shape="equilibrium", spares=0), 5, 0.04)
+    assert [(d.body, d.segment) for d in physics.detachments] == [(5, -1)]
+    physics.detachment_monitor.blades[0].close()
+    physics.step()
+    assert physics.detachments == ()
+    assert physics.faults["cuts_moved"] == 2
+
+
 def test_a_blade_beside_the_end_of_a_cane_cuts_nothing():
     """The tip reaches 6 mm into the mouth, but not to the plane in which the blades close."""
     physics = cut_by_blade(level_cane(shape="equilibrium"), 9, 0.104)
@@ -297,9 +308,7 @@ def test_without_a_spare_body_the_cut_is_at_the_joint_and_says_so(caplog):
     physics.cut(6, 0.05)
     with caplog.at_level(logging.WARNING):
         physics.cut(4, 0.05)
-    assert (
-        "cut 50.0 mm along body 4 was made at its joint: the 2 spare bodies of tree 0 are stumps already" in caplog.text
-    )
+    assert "cut 50.0 mm along body 4 is at its joint: the 2 spare bodies of tree 0 are stumps already" in caplog.text
     physics.step()
     assert [(d.body, d.segment) for d in physics.detachments] == [(4, -1), (6, 6), (8, 8)]
     assert physics.faults["cuts_moved"] == 1

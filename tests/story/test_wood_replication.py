@@ -1,4 +1,4 @@
-"""Wood that has given: the client that owns a tree decides, and all have its set, also clients that join later."""
+"""Wood that has given: the client that owns a tree decides; all clients have its set, also those that join later."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Events of the vineyard as rows for JSON: what left its plant, how blades closed, and what happened to the fruit.
+"""Events of the vineyard as rows for JSON: what left its plant or gave, how blades closed, what happened to the fruit.
 
 Rows come from the client that simulated the event. Other clients learn of its result by the network.
 """
@@ -7,14 +7,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from vinesim.scene.values import BladeClosing, BunchHistory, Detachment, FruitEvent
+from vinesim.scene.values import BladeClosing, Breakage, BunchHistory, Detachment, FruitEvent
 from vinesim.world import Physics
 
 
 def events_of(physics: Physics) -> list[dict[str, Any]]:
-    """Returns the events of the last step: closings of blades first, then detachments, then those of fruit."""
+    """Returns the events of the last step: closings of blades, what gave, detachments, and those of fruit."""
     fruit = [_fruit(physics, event) for event in physics.fruit_monitor.events]
-    return [*map(_closing, physics.closings), *map(_detachment, physics.detachments), *fruit]
+    given = map(_breakage, physics.detachment_monitor.breakages)
+    return [*map(_closing, physics.closings), *given, *map(_detachment, physics.detachments), *fruit]
 
 
 def fruit_report(physics: Physics) -> dict[str, Any]:
@@ -82,4 +83,21 @@ def _detachment(event: Detachment) -> dict[str, Any]:
         "moment": [float(part) for part in event.moment],
         "segment": event.segment,
         "at_m": float(event.at),
+        "place_m": float(event.place),
+        "position": [float(part) for part in event.point],
+    }
+
+
+def _breakage(event: Breakage) -> dict[str, Any]:
+    return {
+        "event": event.kind,
+        "cause": event.cause,
+        "actor": event.actor,
+        "tree": event.tree,
+        "body": event.body,
+        "tie": event.tie,
+        "force": [float(part) for part in event.force],
+        "moment": [float(part) for part in event.moment],
+        "place_m": float(event.place),
+        "position": [float(part) for part in event.point],
     }

@@ -149,7 +149,8 @@ class DetachmentMonitor:
                 before = len(self._detachments)
                 for piece in self._close(blade):
                     if piece.bunch < 0:
-                        self.cut(piece.body, "blade", blade.actor, piece.at)
+                        if not piece.floats or self.plants.stumps.spare_for(piece.body, piece.at) >= 0:
+                            self.cut(piece.body, "blade", blade.actor, piece.at)
                     elif self.plants.state.bunch_attached[piece.bunch]:
                         self.pick(piece.bunch, "blade", blade.actor, piece.segment, piece.at)
                 if not blade.closing:

@@ -1086,7 +1086,7 @@ class Stumps:
         elif not (why := self._obstacle(segment, body, at)):
             return int(free[0])
         self.missing += 1
-        _log.warning("cut %.1f mm along body %d was made at its joint: %s", 1e3 * at, body, why)
+        _log.warning("cut %.1f mm along body %d is at its joint: %s", 1e3 * at, body, why)
         return -1
 
     def can_leave(self, segment: int, at: float) -> bool:

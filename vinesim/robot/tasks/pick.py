@@ -48,6 +48,10 @@ MAX_CUTS = 5
 """Number of times that the cutter closes before the task fails."""
 POSITION_TOLERANCE = 0.01
 """[m] Distance within which the hand has reached its goal. GUESSED"""
+THICK = 0.060
+"""[m] Radius of a bunch from which the hand has to be exactly before it: little room is left between the fingers."""
+THICK_TOLERANCE = 0.003
+"""[m] As :data:`POSITION_TOLERANCE`, before thick bunches. GUESSED"""
 ORIENTATION_TOLERANCE = 0.12
 """[rad] Angle within which the hand has reached the orientation of its goal. GUESSED"""
 CARRY_POSITION = np.array([0.45, 0.12, 1.20])
@@ -180,9 +184,9 @@ class PickBunch(Task):
     def _reach_and_cut(self, ahead: np.ndarray) -> Iterator[str]:
         """Open the hand, bring it before the bunch, and grasp and cut the bunch."""
         self.robot.command_gripper(self.arm.gripper, 2.0 * (self._radius + OPENING_MARGIN))
-        yield from self._move_hand(
-            "reach", lambda: self._grasp_point() - APPROACH_DISTANCE * ahead, ahead, timeout=12.0
-        )
+        near = POSITION_TOLERANCE if self._radius <= THICK else THICK_TOLERANCE
+        before = lambda: self._grasp_point() - APPROACH_DISTANCE * ahead  # noqa: E731
+        yield from self._move_hand("reach", before, ahead, timeout=12.0, near=near)
         yield from self._advance_and_cut(ahead)
 
     def _advance_and_cut(self, ahead: np.ndarray) -> Iterator[str]:
