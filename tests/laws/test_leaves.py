@@ -30,8 +30,8 @@ REACH = leaves.BLADE_RADIUS * SIZE + RADIUS
 
 
 def leafy(radius: float = 0.02, bodies: tuple[int, ...] = (4,), beta: float = 0.01) -> Model:
-    """A level cane of 1 m along x at a height of 2 m. Leaves stand on ``bodies``, 8 cm above it; their midribs are level
-    and across the cane.
+    """A level cane of 1 m along x at a height of 2 m. Leaves stand on ``bodies``, 8 cm above it; their midribs are
+    level and across the cane.
 
     A cane of the ``radius`` 2 cm gives way to a leaf by less than a hundredth of what the petiole does.
     """
@@ -66,7 +66,7 @@ def test_a_leaf_gives_way_as_its_petiole_bends() -> None:
     """A ball that is held in a leaf feels the overlap times the stiffness of the petiole, within 2 %."""
     for depth in (0.01, 0.03, 0.05):
         simulation = Simulation(leafy(), parameters=touching())
-        at = middle(simulation) + [0.0, 0.0, REACH - depth]
+        at = middle(simulation) + np.array([0.0, 0.0, REACH - depth])
         simulation.add_pusher(size=(RADIUS,), position=at, mass=5.0, force=500.0)
         simulation.step(100)
         (contact,) = simulation.contacts
@@ -79,9 +79,9 @@ def test_a_hand_passes_through_a_leaf_which_springs_back() -> None:
     much work as the damping of the contact takes, a small share of what bends the petiole."""
     simulation = Simulation(leafy(), parameters=touching())
     speed = 0.05
-    start = middle(simulation) - [REACH + 0.01, 0.0, 0.0]
+    start = middle(simulation) - np.array([REACH + 0.01, 0.0, 0.0])
     ball = simulation.add_pusher(size=(RADIUS,), position=start, mass=5.0, force=500.0)
-    ball.follow(start + [2.0 * REACH + 0.02, 0.0, 0.0], speed=speed)
+    ball.follow(start + np.array([2.0 * REACH + 0.02, 0.0, 0.0]), speed=speed)
     force = []
     for _ in range(round((2.0 * REACH + 0.02) / speed / 0.01) + 50):
         simulation.step()
@@ -120,9 +120,9 @@ def test_leaves_add_no_energy(speed: float, dt: float) -> None:
 def test_a_hand_of_many_geoms_bends_a_petiole_once() -> None:
     """Of two balls that overlap the same leaf, the deeper one pushes it aside."""
     simulation = Simulation(leafy(), parameters=touching())
-    at = middle(simulation) + [0.0, 0.0, REACH]
+    at = middle(simulation) + np.array([0.0, 0.0, REACH])
     for name, depth in (("shallow", 0.02), ("deep", 0.04)):
-        beside = [0.0, 0.025 if name == "deep" else -0.025, -depth]
+        beside = np.array([0.0, 0.025 if name == "deep" else -0.025, -depth])
         simulation.add_pusher(size=(RADIUS,), position=at + beside, mass=5.0, force=500.0, name=name)
     simulation.step(100)
     (contact,) = [contact for contact in simulation.contacts if contact.body == 4]
@@ -135,7 +135,7 @@ def test_only_a_near_leaf_wakes_its_vine() -> None:
     are only seen it sleeps on."""
     for kind, distance, wakes in (("touch", REACH + 0.02, False), ("touch", REACH, True), ("ghost", REACH, False)):
         simulation = Simulation(leafy(), parameters=PhysicsParameters(leaves=kind))
-        at = middle(simulation) + [0.0, 0.0, distance]
+        at = middle(simulation) + np.array([0.0, 0.0, distance])
         simulation.add_pusher(size=(RADIUS,), position=at, mass=5.0, force=500.0)
         simulation.step(20)
         assert (len(simulation.awake) > 0) == wakes, (kind, distance)
@@ -158,7 +158,7 @@ def test_two_runs_are_equal_to_the_bit() -> None:
     hashes = []
     for _ in range(2):
         physics = Physics(leafy(0.004, (4, 7, 10)), parameters=touching())
-        drives = (Drive("along", 5000.0, 300.0, 1e3, 5.0, -5.0, 5.0), Drive("press", 5000.0, 300.0, 1e3, 5.0, -5.0, 5.0))
+        drives = tuple(Drive(name, 5000.0, 300.0, 1e3, 5.0, -5.0, 5.0) for name in ("along", "press"))
         physics.add_robot(probe((0.2, 0.0, 2.07), drives=drives))
         h = hashlib.blake2b(digest_size=16)
         count = 0

@@ -103,10 +103,10 @@ class PlantArrays:
         self.leaves: structs.Leaves | None = None
         """Leaves that can be touched; None without any."""
         if len(capsules.body) > capsules.tree_start[-1]:
-            self.leaves = structs.Leaves()
-            self.leaves.tree_start = share(capsules.leaf_start, wp.int32)
-            self.leaves.reach = share(capsules.leaf_reach, wp.float32)
-            self.leaves.most_reach = float(capsules.leaf_reach.max())
+            self.leaves = leaves = structs.Leaves()
+            leaves.tree_start = share(capsules.leaf_start, wp.int32)
+            leaves.reach = share(capsules.leaf_reach, wp.float32)
+            leaves.most_reach = float(capsules.leaf_reach.max())
 
 
 def _tied_geoms(model: Model) -> tuple[np.ndarray, np.ndarray]:

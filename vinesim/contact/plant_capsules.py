@@ -170,7 +170,7 @@ def pass_leaves(capsules: PlantCapsules, model: Model, parts: list[tuple[int, fl
     bodies = [body for body, _, _ in parts]
     tree = model.body_tree[bodies[-1]]
     first = int(capsules.tree_start[-1])
-    of_tree = np.arange(capsules.leaf_start[tree], capsules.leaf_start[tree + 1])
+    of_tree = np.arange(int(capsules.leaf_start[tree]), int(capsules.leaf_start[tree + 1]))
     here = of_tree[model.leaf_body[capsules.leaf[of_tree - first]] == bodies[-1]]
     node = model.leaf_base[capsules.leaf[here - first], 0]
     ends = [end for _, _, end in parts[:-1]]
