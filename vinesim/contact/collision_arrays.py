@@ -91,6 +91,7 @@ class PlantArrays:
             local_start=capsules.start,
             local_end=capsules.end,
             radius=capsules.radius,
+            stiffness=capsules.stiffness,
             material=capsules.material,
             extent=(ends + capsules.radius).astype(np.float32),
             rest_start=rest_start,
@@ -99,6 +100,13 @@ class PlantArrays:
             tied_joint=tied_joint[capsules.body],
         )
         self.capsule_states = SharedArrays.zeros(structs.CapsuleStates, len(capsules.body))
+        self.leaves: structs.Leaves | None = None
+        """Leaves that can be touched; None without any."""
+        if len(capsules.body) > capsules.tree_start[-1]:
+            self.leaves = leaves = structs.Leaves()
+            leaves.tree_start = share(capsules.leaf_start, wp.int32)
+            leaves.reach = share(capsules.leaf_reach, wp.float32)
+            leaves.most_reach = float(capsules.leaf_reach.max())
 
 
 def _tied_geoms(model: Model) -> tuple[np.ndarray, np.ndarray]:
@@ -227,6 +235,7 @@ class RigidArrays:
         actor = listed.actor
         is_remote = self.geoms.is_remote
         is_remote[:count] = [name in remote_actors for name in actor]
+        self.geoms.touches_leaves[:count] = [name in rigid.actors for name in actor]
         self.bunch_of_geom[:count] = [int(name[6:]) if name.startswith("bunch/") else -1 for name in actor]
         self.geoms.count[:] = movable, count
         fixed = np.flatnonzero(self._is_wire) + FIRST_FIXED_GEOM

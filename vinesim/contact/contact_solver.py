@@ -16,7 +16,7 @@ import numpy as np
 from vinesim.contact.collision_arrays import PlantArrays, RigidArrays, kernel_parameters
 from vinesim.contact.detection import ContactDetection
 from vinesim.contact.impulse_solver import ImpulseSolver
-from vinesim.contact.plant_capsules import HIDDEN, nearest_body, plant_capsules
+from vinesim.contact.plant_capsules import HIDDEN, nearest_body, pass_leaves, plant_capsules, with_leaves
 from vinesim.kernels.contact import structs
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.rigid.rigid_world import RigidWorld
@@ -49,6 +49,8 @@ class ContactSolver:
         self.rigid = rigid
         self.parameters = rigid.parameters
         self.capsules = plant_capsules(model)
+        if self.parameters.leaves == "touch" and len(model.leaf_body):
+            self.capsules = with_leaves(self.capsules, model, self.parameters)
         self.plant_plant_contacts = True
         """Whether bunches and branches of awake trees touch each other too."""
         self.count = 0
@@ -290,7 +292,9 @@ class ContactSolver:
         plants = self.plants
         shapes = self.capsules
         parts = plants.stumps.parts_of(segment)
-        first = np.searchsorted(shapes.body, [body for body, _, _ in parts]).tolist()
+        pass_leaves(shapes, self.model, parts)
+        of_wood = shapes.body[: shapes.tree_start[-1]]
+        first = np.searchsorted(of_wood, [body for body, _, _ in parts]).tolist()
         last = first[-1]
         for (body, _, _), capsule in zip(parts[:-1], first[:-1], strict=True):
             if shapes.level[capsule] == HIDDEN:

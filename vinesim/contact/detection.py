@@ -15,6 +15,7 @@ from vinesim.contact.collision_arrays import PlantArrays, RigidArrays
 from vinesim.core.warp_arrays import SharedArrays, share
 from vinesim.kernels.contact import (
     broadphase,
+    leaves,
     narrowphase_plants,
     narrowphase_rigid,
     sleeping_trees,
@@ -291,6 +292,49 @@ class ContactDetection:
             given = [parameters, geoms, count, rigid.bodies.struct]
             return KernelLaunch(broadphase.geom_aabbs, given, [geom_states], threads=most)
 
+        mark_near_leaves: tuple[KernelLaunch, ...] = ()
+        find_leaf_contacts: tuple[KernelLaunch, ...] = ()
+        if plants.leaves is not None:
+            mark_near_leaves = (
+                KernelLaunch(
+                    leaves.mark_trees_with_near_leaves,
+                    [
+                        parameters,
+                        actors,
+                        capsules,
+                        plants.leaves,
+                        trees,
+                        bodies,
+                        block_boxes,
+                        tree_boxes,
+                        actor_boxes,
+                        geom_states,
+                    ],
+                    [share(self._is_near, wp.bool), counters],
+                    threads=len(self._blocks),
+                ),
+            )
+            find_leaf_contacts = (
+                KernelLaunch(
+                    leaves.find_leaf_contacts,
+                    [
+                        1,
+                        parameters,
+                        capsules,
+                        plants.leaves,
+                        geoms,
+                        counters,
+                        trees,
+                        tree_boxes,
+                        bodies,
+                        rigid.bodies.struct,
+                        rigid.hulls.struct,
+                        geom_states,
+                    ],
+                    [capsule_states, candidates],
+                    threads=1,
+                ),
+            )
         self._bound_all_geoms = KernelGraph(bound_geoms(listed, rigid.capacity))
         self._find_near_trees = KernelGraph(
             rigid.take_free_velocities,
@@ -307,6 +351,7 @@ class ContactDetection:
                 [share(self._is_near, wp.bool), counters],
                 threads=len(self._blocks),
             ),
+            *mark_near_leaves,
         )
         # without the boxes of blocks, actors near a tree that was dragged out of its block would be missed
         self._find_reached_trees = KernelGraph(
@@ -363,5 +408,6 @@ class ContactDetection:
                 ],
                 [candidates],
             ),
+            *find_leaf_contacts,
         )
         """Launches that fill ``candidates`` for the listed awake trees."""

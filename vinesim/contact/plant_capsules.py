@@ -1,4 +1,5 @@
-"""Collision capsules of plants: one for each piece of wood, a few for each bunch, one for each berry cluster."""
+"""Collision capsules of plants: one for each piece of wood, a few for each bunch, one for each berry cluster, and one
+for each leaf if leaves can be touched."""
 
 from __future__ import annotations
 
@@ -7,21 +8,34 @@ import dataclasses
 import numpy as np
 
 from vinesim.core import frames
-from vinesim.scene.materials import materials_of_organs
+from vinesim.scene import leaves
+from vinesim.scene.materials import Material, materials_of_organs
 from vinesim.scene.model import Model
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
 
 MAX_SPHERES_PER_BUNCH = 7
 HIDDEN = 3
-"""Level of detail of the capsule of a spare body, which does not exist until a cut makes the body a stump."""
+"""Level of detail of the capsule of a spare body, which does not exist until a cut makes the body a stump. Also of
+leaves, which stand outside of the ranges of trees."""
+MIN_PETIOLE_LENGTH = 0.01
+"""[m] A shorter petiole is as stiff as one of this length."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PlantCapsules:
-    """Collision shapes of all plants: segments with a radius, sorted by body."""
+    """Collision shapes of all plants: segments with a radius, sorted by body. Leaves come after all other shapes,
+    sorted by tree."""
 
     tree_start: np.ndarray
-    """[tree + 1] Index of the first capsule of each tree; the last entry is the number of capsules."""
+    """[tree + 1] Index of the first capsule of each tree; the last entry is the number of capsules
+    that are no leaves."""
+    leaf_start: np.ndarray
+    """[tree + 1] Index of the first leaf of each tree; the last entry is the number of capsules."""
+    leaf: np.ndarray
+    """[k] Number in the model of each leaf that has a capsule."""
+    leaf_reach: np.ndarray
+    """[tree] m, largest distance of a point of a leaf's capsule from the axis of the body that carries the leaf."""
     body: np.ndarray
     """[capsule] Index of the body that the capsule belongs to."""
     bunch: np.ndarray
@@ -49,6 +63,8 @@ class PlantCapsules:
     """[capsule] m, radius."""
     material: np.ndarray
     """[capsule] :class:`Material` of the surface."""
+    stiffness: np.ndarray
+    """[capsule] N/m, stiffness of contacts of a leaf, which gives way by its petiole; 0: that of the materials."""
 
 
 def plant_capsules(model: Model) -> PlantCapsules:
@@ -85,8 +101,12 @@ def plant_capsules(model: Model) -> PlantCapsules:
             parts.append((b, bunch_of[b], 0, 0.0, length, thick))
     body, bunch, level, start, end, radius = np.array(parts, float).reshape(-1, 6).T  # also correct without bodies
     along = np.array([1.0, 0.0, 0.0], np.float32)
+    tree_start = np.searchsorted(body, np.append(model.tree_first, len(model.body_mass))).astype(np.int32)
     return PlantCapsules(
-        tree_start=np.searchsorted(body, np.append(model.tree_first, len(model.body_mass))).astype(np.int32),
+        tree_start=tree_start,
+        leaf_start=np.full(len(tree_start), len(body), np.int32),
+        leaf=np.zeros(0, np.int32),
+        leaf_reach=np.zeros(len(model.tree_first), np.float32),
         body=body.astype(np.int32),
         bunch=bunch.astype(np.int32),
         branch=np.where(bunch < 0, branches(model)[body.astype(np.int32)], -1).astype(np.int32),
@@ -95,7 +115,66 @@ def plant_capsules(model: Model) -> PlantCapsules:
         end=end.astype(np.float32)[:, None] * along,
         radius=radius.astype(np.float32),
         material=materials_of_organs(model.body_organ[body.astype(np.int32)]),
+        stiffness=np.zeros(len(body)),
     )
+
+
+def with_leaves(capsules: PlantCapsules, model: Model, parameters: PhysicsParameters) -> PlantCapsules:
+    """Returns the capsules, followed by one for each leaf, along the lower part of its midrib
+    (:data:`leaves.BLADE_LENGTH`).
+
+    The capsule stays on the body that carries the leaf. It gives way by overlapping: its contact has the stiffness of
+    the petiole against a force at the middle of the capsule.
+    """
+    order = np.argsort(model.body_tree[model.leaf_body], kind="stable")
+    pose = model.leaf_pose[order].astype(float)
+    base = model.leaf_base[order].astype(float)
+    size = model.leaf_size[order].astype(float)
+    body = model.leaf_body[order]
+    length = leaves.BLADE_LENGTH * size
+    start = pose[:, :3]
+    end = start + length[:, None] * frames.rotate(pose[:, 3:], np.array([1.0, 0.0, 0.0]))
+    radius = leaves.BLADE_RADIUS * size
+    petiole = np.maximum(np.linalg.norm(start - base, axis=1), MIN_PETIOLE_LENGTH)
+    stiffness = leaves.petiole_stiffness(
+        petiole, leaves.PETIOLE_DIAMETER * size, 0.5 * length, parameters.petiole_modulus
+    )
+    on_axis = np.array([1.0, 0.0, 0.0]) * np.clip(base[:, :1], 0.0, model.body_length[body].astype(float)[:, None])
+    away = np.maximum(np.linalg.norm(start - on_axis, axis=1), np.linalg.norm(end - on_axis, axis=1)) + radius
+    tree = model.body_tree[body]
+    reach = np.zeros(len(model.tree_first), np.float32)
+    np.maximum.at(reach, tree, away.astype(np.float32))
+    count = len(capsules.body)
+    of_leaves = {
+        "body": body,
+        "bunch": np.full(len(body), -1),
+        "branch": np.full(len(body), -1),
+        "level": np.full(len(body), HIDDEN),
+        "start": start,
+        "end": end,
+        "radius": radius,
+        "material": np.full(len(body), int(Material.LEAF)),
+        "stiffness": stiffness,
+    }
+    joined = {
+        name: np.concatenate([before := getattr(capsules, name), values]).astype(before.dtype)
+        for name, values in of_leaves.items()
+    }
+    leaf_start = count + np.searchsorted(tree, np.arange(len(model.tree_first) + 1))
+    return dataclasses.replace(capsules, leaf_start=leaf_start.astype(np.int32), leaf=order, leaf_reach=reach, **joined)
+
+
+def pass_leaves(capsules: PlantCapsules, model: Model, parts: list[tuple[int, float, float]]) -> None:
+    """Pass the leaves of a divided segment to the bodies on which they grow now. ``parts``: body, start [m] and end [m]
+    of each part of the segment, from its joint to its tip; all parts have the frame of the segment."""
+    bodies = [body for body, _, _ in parts]
+    tree = model.body_tree[bodies[-1]]
+    first = int(capsules.tree_start[-1])
+    of_tree = np.arange(int(capsules.leaf_start[tree]), int(capsules.leaf_start[tree + 1]))
+    here = of_tree[model.leaf_body[capsules.leaf[of_tree - first]] == bodies[-1]]
+    node = model.leaf_base[capsules.leaf[here - first], 0]
+    ends = [end for _, _, end in parts[:-1]]
+    capsules.body[here] = np.array(bodies, np.int32)[np.searchsorted(ends, node, side="right")]
 
 
 def branches(model: Model) -> np.ndarray:

@@ -35,6 +35,7 @@ class Material(enum.IntEnum):
     STEEL = 7
     """Steel and other bare metal."""
     SOIL = 8
+    LEAF = 9
 
 
 OF_ORGAN = {

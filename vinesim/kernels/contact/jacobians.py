@@ -85,13 +85,29 @@ def with_wire(surface: Surface, wire_stiffness: wp.float64, parameters: Paramete
 
 
 @wp.func
+def with_petiole(surface: Surface, petiole_stiffness: wp.float64, dt: wp.float64):
+    """Returns the surface of a contact with a leaf, which gives way by its petiole [N/m]. The time constant of the
+    contact's damping stays."""
+    surface.damping = surface.damping * petiole_stiffness / surface.stiffness
+    surface.stiffness = petiole_stiffness
+    surface.compliance = wp.float64(1.0) / (dt * (surface.stiffness * dt + surface.damping))
+    return surface
+
+
+@wp.func
 def write_bias(
-    c: int, parameters: Parameters, end_gap: wp.float64, contacts: Contacts, warm_start: WarmStart, rows_out: Rows
+    c: int,
+    parameters: Parameters,
+    end_gap: wp.float64,
+    is_limited: bool,
+    contacts: Contacts,
+    warm_start: WarmStart,
+    rows_out: Rows,
 ):
     """Write the bias velocities and the initial guess of the impulses of one contact.
 
     The spring of an open contact exerts no force before the gap is closed within the step. The limit on the speed of
-    separation does not apply to a wire's spring.
+    separation (``is_limited``) does not apply to the springs of wires and petioles.
     """
     feature = contacts.feature[c]
     other = contacts.other[c]
@@ -102,7 +118,7 @@ def write_bias(
         rows_out.bias[3 * c] = end_gap / parameters.dt
     else:
         rows_out.bias[3 * c] = end_gap * stiffness / share
-        if contacts.wire_stiffness[c] == wp.float64(0.0):
+        if is_limited:
             rows_out.bias[3 * c] = wp.max(rows_out.bias[3 * c], -parameters.max_separation_speed)
     t1 = wp.vec3d(axes[1, 0], axes[1, 1], axes[1, 2])
     t2 = wp.vec3d(axes[2, 0], axes[2, 1], axes[2, 2])
@@ -152,7 +168,9 @@ def write_rows(
     body = contacts_out.body[c]
     lever = x - to_double(wp.transform_get_translation(bodies.q[body]))
     velocity = velocity_at(bodies.q[body], bodies.qd_free[body], x)
-    material = capsules.material[contacts_out.feature[c] // 2]
+    capsule = contacts_out.feature[c] // 2
+    material = capsules.material[capsule]
+    petiole = capsules.stiffness[capsule]
     other = contacts_out.other_body[c]
     other_lever = lever
     last_dof = int(-1)
@@ -163,6 +181,8 @@ def write_rows(
             surface.friction = geoms.friction[g]
         if contacts_out.wire_stiffness[c] > wp.float64(0.0):
             surface = with_wire(surface, contacts_out.wire_stiffness[c], parameters)
+        if petiole > wp.float64(0.0):
+            surface = with_petiole(surface, petiole, parameters.dt)
         contacts_out.surface[c] = surface
         last_dof = geoms.dof[g]
         arm = x - rigid.subtree_com[geoms.root[g]]
@@ -186,7 +206,8 @@ def write_rows(
         rows_out.bias[row] = wp.float64(0.0)
         rows_out.impulse[row] = wp.float64(0.0)
     end_gap = candidates.end_gap[tree_row, slot] + contacts_out.wire_shift[c]
-    write_bias(c, parameters, end_gap, contacts_out, warm_start, rows_out)
+    is_limited = contacts_out.wire_stiffness[c] == wp.float64(0.0) and petiole == wp.float64(0.0)
+    write_bias(c, parameters, end_gap, is_limited, contacts_out, warm_start, rows_out)
 
 
 @wp.func

@@ -134,6 +134,8 @@ class Capsules:
     local_end: wp.array(dtype=wp.vec3)
     radius: wp.array(dtype=float)
     """[capsule] Radius, m."""
+    stiffness: wp.array(dtype=wp.float64)
+    """[capsule] Stiffness of the contacts of a leaf, N/m; 0: that of the two materials."""
     material: wp.array(dtype=wp.int32)
     """[capsule] Material of the surface (``Material``)."""
     extent: wp.array(dtype=float)
@@ -152,6 +154,19 @@ class Capsules:
 
     -1 if the capsule's own body is tied.
     """
+
+
+@wp.struct
+class Leaves:
+    """Capsules of leaves, which touch robots and people only. They stand after all capsules of :class:`Capsules` that
+    belong to the range of a tree."""
+
+    tree_start: wp.array(dtype=wp.int32)
+    """[tree + 1] First leaf of each tree."""
+    reach: wp.array(dtype=float)
+    """[tree] Largest distance of a point of a leaf from the axis of the body that carries it, m."""
+    most_reach: float
+    """[m] Largest ``reach`` of all trees."""
 
 
 @wp.struct
@@ -218,6 +233,8 @@ class Geoms:
     is_remote: wp.array(dtype=wp.bool)
     """[geom] Whether the geom belongs to a copy of another client's robot or person. Such a geom touches remote trees
     only."""
+    touches_leaves: wp.array(dtype=wp.bool)
+    """[geom] Whether the geom belongs to a robot or a person."""
 
 
 @wp.struct
