@@ -19,7 +19,7 @@ from tests.support import programs
 from tests.support.waiting import wait
 from vinesim.net.codec.control import Hello, RetainedRecord, Welcome, decode_welcome, encode_hello, encode_records, pack
 from vinesim.net.codec.meshes import MAX_PART, MeshPart, MeshWanted, decode_wanted, encode_part
-from vinesim.net.server import admission, retained_store
+from vinesim.net.server import admission, retained_store, sessions
 from vinesim.net.server.journal import Journal
 from vinesim.net.server.server import Server
 from vinesim.net.transport import name_holders, zenoh_bus
@@ -77,7 +77,7 @@ class CommandLineServer:
         return self.process.returncode, output
 
 
-@pytest.mark.parametrize("world", ["w" * 260, "a b"])
+@pytest.mark.parametrize("world", ["w" * 260, "a b"], ids=["long", "blank"])
 def test_a_world_with_a_name_that_no_file_can_have_stops_the_records_of_no_other(tmp_path, world):
     server = CommandLineServer("--state-dir", str(tmp_path))
     with stranger(server.endpoint) as session:
@@ -289,6 +289,7 @@ def test_the_memory_of_a_server_and_of_a_client_does_not_grow_with_joins_and_lea
     """What Python holds, by tracemalloc, after 400 joins and leaves of new names, and after 200 more."""
     monkeypatch.setattr(logging.root.manager, "disable", logging.CRITICAL)  # pytest keeps what is logged
     monkeypatch.setattr(admission, "JOIN_BURST_TIME", 1.0)
+    monkeypatch.setattr("vinesim.net.server.server.MAX_WARNED", 20)
     monkeypatch.setattr(name_holders, "MAX_FORMER_NAMES", 50)
     monkeypatch.setattr(retained_store, "MAX_BUCKETS", 50)
     monkeypatch.setattr(retained_store, "BURST_TIME", 0.1)
@@ -314,5 +315,17 @@ def test_the_memory_of_a_server_and_of_a_client_does_not_grow_with_joins_and_lea
             after = join(400, 600)
         finally:
             tracemalloc.stop()
-        assert after - before < 200 * 150  # B: less than 150 B for each join, where the names alone have 200 B
+        assert after - before < 200 * 250  # B for each join; one entry in one table by name has more
         assert len(server._admission._admitted) == 1
+
+
+def test_sessions_are_no_more_than_the_system_has_files_for(monkeypatch, caplog):
+    limits = [256, 1024]
+    monkeypatch.setattr(sessions.resource, "getrlimit", lambda _: tuple(limits))
+    monkeypatch.setattr(sessions.resource, "setrlimit", lambda _, pair: limits.__setitem__(slice(None), pair))
+    assert sessions.fit_sessions(None, None) == 1024 - sessions.SPARE_FILES
+    assert caplog.text == ""
+    assert limits == [1024, 1024]
+    assert sessions.fit_sessions(None, 5) == 110
+    assert sessions.fit_sessions(2000, None) == 1024 - sessions.SPARE_FILES
+    assert "enough for 768 of 2000 sessions" in caplog.text

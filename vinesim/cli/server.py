@@ -67,7 +67,9 @@ def run(
         if status != "json":
             print(f"listening on {', '.join(map(str, server.endpoints))}", flush=True)
         try:
-            while not stop.wait(STATUS_PERIOD if status != "none" else None):
+            while not stop.wait(STATUS_PERIOD):  # not for ever: another thread may have got the signal
+                if status == "none":
+                    continue
                 figures = server.figures()
                 print(json.dumps(figures) if status == "json" else _line(figures), flush=True)
         except BrokenPipeError:  # the reader of standard output has closed it: the run ends without an error

@@ -28,7 +28,7 @@ from vinesim.net.server.admission import GRACE_TIME, AdmissionControl, JoinLimit
 from vinesim.net.server.main_server_watch import WATCH_PERIOD, MainServerWatch
 from vinesim.net.server.mesh_store import MeshStore
 from vinesim.net.server.retained_store import Quota, RetainedStore
-from vinesim.net.server.sessions import SessionTable, max_sessions_for, raise_file_limit
+from vinesim.net.server.sessions import SessionTable, fit_sessions
 from vinesim.net.transport import endpoints
 from vinesim.net.transport.access_control import SERVER, acl_config, server_answers_config, tls_config
 from vinesim.net.transport.bus import BusError
@@ -113,7 +113,7 @@ class Server:
         ``real_time_factor``: fixed real-time factor of all worlds; None: each world is as fast as its clients can
         follow, at most 1. ``limits``: limits for joins; ``max_actors`` replaces one of them. ``max_sessions``: largest
         number of Zenoh sessions, of which a client on another machine opens two; None: as many as ``max_actors`` need,
-        see :func:`vinesim.net.server.sessions.max_sessions_for`.
+        see :func:`vinesim.net.server.sessions.fit_sessions`.
 
         Raises :class:`PortTaken`, :class:`vinesim.core.errors.UsageError` for an invalid endpoint or combination,
         :class:`vinesim.net.server.journal.JournalError` and
@@ -154,8 +154,7 @@ class Server:
         self._malformed = 0
         self._admission = AdmissionControl(scene, max_actors, spectators_speak_to, limits)
         self._admission.reserved_until = time.monotonic() + GRACE_TIME
-        self._max_sessions = max_sessions_for(max_actors) if max_sessions is None else max_sessions
-        raise_file_limit(self._max_sessions)
+        self._max_sessions = fit_sessions(max_sessions, max_actors)
         self._sessions = SessionTable(self._max_sessions)
         self._empty_since: dict[str, float] = {}
         """Time since when a world of the store has no actors [s], by world."""

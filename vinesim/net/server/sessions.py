@@ -27,24 +27,29 @@ def max_sessions_for(max_actors: int | None) -> int:
     return DEFAULT_MAX_SESSIONS if max_actors is None else SESSIONS_PER_CLIENT * max_actors + SPARE_SESSIONS
 
 
-def raise_file_limit(sessions: int) -> None:
-    """Raise the limit of open files of this process so that ``sessions`` find a socket each, as far as the system
-    allows. A warning tells if it does not."""
+def fit_sessions(sessions: int | None, max_actors: int | None) -> int:
+    """Returns the largest number of sessions of a server: ``sessions``, or by default :func:`max_sessions_for`
+    ``max_actors``, as far as the system has open files for them.
+
+    Raises the limit of open files of this process for that. A warning tells if ``sessions`` or ``max_actors`` were
+    given and the system allows less.
+    """
+    wanted = max_sessions_for(max_actors) if sessions is None else sessions
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = sessions + SPARE_FILES
-    if soft == resource.RLIM_INFINITY or soft >= wanted:
-        return
-    allowed = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
+    if soft == resource.RLIM_INFINITY or soft >= wanted + SPARE_FILES:
+        return wanted
+    allowed = wanted + SPARE_FILES if hard == resource.RLIM_INFINITY else min(wanted + SPARE_FILES, hard)
     if allowed > soft:
         resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
-    if allowed < wanted:
+    fitting = max(1, max(allowed, soft) - SPARE_FILES)
+    if fitting < wanted and (sessions, max_actors) != (None, None):
         log.warning(
-            "%d sessions need %d open files and the system allows %d: raise the limit (ulimit -n), or give less with "
-            "--max-sessions",
-            sessions,
-            wanted,
+            "the system allows this program %d open files, enough for %d of %d sessions: raise the limit (ulimit -n)",
             allowed,
+            fitting,
+            wanted,
         )
+    return min(fitting, wanted)
 
 
 class SessionTable:
