@@ -189,7 +189,7 @@ def _leaf_texture() -> disk_cache.Arrays:
         wide = _smooth_noise(rng, 9.0)
         net = np.exp(-((fine / 0.25) ** 2))  # areoles: where a band-limited noise crosses zero
         puffed = 1.0 - np.exp(-((away_from_vein / 0.05) ** 2))  # the blade rises between its veins
-        height = 0.019 * puffed + 0.004 * wide + 0.0018 * fine
+        height = 0.015 * puffed + 0.004 * wide + 0.0018 * fine
         slope_v, slope_u = np.gradient(height, 2.0 / TEXTURE_SIZE)
         tone = 0.47 + 0.05 * wide + 0.07 * fine + 0.15 * np.exp(-((away_from_vein / 0.024) ** 2))
         for spot_u, spot_v, size in rng.uniform((-0.7, -0.4, 0.008), (0.7, 0.8, 0.03), (6 * (shape % 4 > 1), 3)):
