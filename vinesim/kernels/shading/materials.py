@@ -271,7 +271,7 @@ def trait(seed: float, factor: float) -> float:
 def leaf_sheen(gloss: float) -> float:
     """Returns how well a leaf mirrors its surroundings, from its ``gloss``, 0 to 1: GUESSED, by the blue of photographed
     leaves below the sky."""
-    return 0.7 + 1.5 * gloss
+    return 0.55 + 1.15 * gloss
 
 
 @wp.func
@@ -281,8 +281,8 @@ def blade_colour(tint: wp.vec3, tone: float, wide: float, middle: float, hue: fl
     ``wide``, ``middle`` and ``hue`` are noise around 0.5: brightness in large and in small patches, and yellowness.
     """
     warm = wp.clamp(hue - 0.58, -0.4, 0.4)
-    bright = (0.62 + 0.68 * tone) * (0.66 + 0.50 * wide + 0.18 * middle)
-    return wp.cw_mul(tint, wp.vec3(1.0 + 0.8 * warm, 1.0 + 0.35 * warm, 1.0 - 0.1 * warm)) * bright
+    bright = (0.62 + 0.70 * tone) * (0.82 + 0.26 * wide + 0.10 * middle)
+    return wp.cw_mul(tint, wp.vec3(1.0 + 0.5 * warm, 1.0 + 0.2 * warm, 1.0 - 0.1 * warm)) * bright
 
 
 @wp.func
@@ -438,7 +438,7 @@ def leaf_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, d: wp.vec3
             clear = wp.clamp(wp.abs(wp.dot(up, d)) * 2.2, 0.0, 1.0) / (1.0 + 3.0 * pixel / size)
             vein = t[0] * clear
             # the blade is puckered between its veins, and each leaf has waves of its own
-            wave = 0.5 + 0.9 * trait(c4[3], 57.77)
+            wave = 0.25 + 0.5 * trait(c4[3], 57.77)
             s.normal = wp.normalize(
                 side * (slope_u - t[1] * clear + (spot[1] - 0.5) * wave)
                 + rib * (slope_v - t[2] * clear + (spot[2] - 0.5) * wave)
@@ -456,14 +456,14 @@ def leaf_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, d: wp.vec3
                 * 0.0025
             )
             s.albedo = turned_colour(materials.colours, s.albedo, age, edge, vein, spot[0], spot[1], spot[2])
-        s.transmission = wp.cw_mul(s.albedo, materials.colours.through) * (1.0 - 0.45 * vein)
+        s.transmission = wp.cw_mul(s.albedo, materials.colours.through) * (1.0 - 0.55 * vein)
         if wp.dot(plain, d) > 0.0:  # the lower side is paler, felted, with raised veins
             s.albedo = mix(s.albedo * 1.05, materials.colours.under, 0.42)
             s.albedo = mix(s.albedo, materials.colours.under_vein, vein * 0.7)
             s.specular = 0.012
             s.shininess = 6.0
         else:
-            s.albedo = mix(s.albedo, materials.colours.vein, vein * 0.65)
+            s.albedo = mix(s.albedo, materials.colours.vein, vein * 0.85)
             s.specular = 0.035 + 0.03 * gloss
             s.shininess = 9.0 + 26.0 * gloss * gloss
             s.reflectivity = leaf_sheen(gloss)

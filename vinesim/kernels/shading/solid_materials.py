@@ -143,25 +143,25 @@ def bark_surface(materials: Materials, s: Surface, old: bool, grain: wp.vec3, se
     )
     x = grain[0] + 0.022 * (bow[1] - 0.5)
     y = grain[1] + 0.022 * (bow[2] - 0.5)
-    wide = sample_bilinear(materials.noise_texture, x * 4.6 + y * 1.3 + seed, grain[2] * 0.75 + y * 2.4 + x * 0.9)
+    wide = sample_bilinear(materials.noise_texture, x * 7.5 + y * 2.1 + seed, grain[2] * 0.7 + y * 2.4 + x * 0.9)
     fine = sample_bilinear(
-        materials.noise_texture, x * 7.0 - y * 5.5 - seed, grain[2] * 1.15 + (x + y) * 2.2 + seed * 0.7
+        materials.noise_texture, x * 13.0 - y * 10.0 - seed, grain[2] * 1.0 + (x + y) * 2.2 + seed * 0.7
     )
     height = 0.5 + ((0.40 * wide[2] + 0.26 * wide[3] + 0.34 * fine[2] + 0.25 * (bow[1] - 0.5)) - 0.5) * clear
     ridge = smoothstep(0.36, 0.64, height)
     relief = float(1.1)
     if old:
         grey = (tint[0] + tint[1] + tint[2]) / 3.0
-        s.albedo = mix(tint, wp.vec3(grey, grey, grey), 0.8 * wide[0]) * (
-            (0.42 + 0.75 * ridge) * (0.65 + 0.7 * wide[1])
+        s.albedo = mix(tint, wp.vec3(grey, grey, grey), 0.3 + 0.6 * wide[0]) * (
+            (0.70 + 0.42 * ridge) * (0.82 + 0.36 * wide[1])
         )
-        s.albedo = mix(s.albedo, wp.vec3(0.150, 0.143, 0.130), 0.55 * smoothstep(0.46, 0.72, wide[0]) * ridge)
+        s.albedo = mix(s.albedo, wp.vec3(0.175, 0.165, 0.150), 0.45 * smoothstep(0.46, 0.72, wide[0]) * ridge)
         # inner bark where a strip has come off
-        s.albedo = mix(s.albedo, wp.vec3(0.120, 0.068, 0.040), 0.7 * smoothstep(0.60, 0.74, bow[1]))
-        relief = 1.7
+        s.albedo = mix(s.albedo, wp.vec3(0.115, 0.080, 0.056), 0.4 * smoothstep(0.60, 0.74, bow[1]))
+        relief = 1.3
     else:
         s.albedo = mix(materials.colours.bark_dark, materials.colours.bark_light, ridge) * (0.7 + 0.6 * wide[1])
-    s.occlusion = 0.35 + 0.65 * smoothstep(0.34, 0.54, height)
+    s.occlusion = 0.5 + 0.5 * smoothstep(0.34, 0.50, height)
     s.normal = wp.normalize(
         s.normal
         + wp.vec3(wide[2] + 0.7 * fine[3] - 0.85, fine[2] + 0.5 * wide[3] - 0.75, bow[2] + 0.6 * fine[1] - 0.8)
@@ -187,7 +187,7 @@ def woody_surface(
         if near:
             # fine ribs along the cane, patches of unlike ripeness, dark specks
             rib = sample_bilinear(
-                materials.noise_texture, grain[0] * 9.0 + grain[1] * 7.0 + seed, grain[2] * 0.7 + seed * 3.1
+                materials.noise_texture, grain[0] * 12.0 + grain[1] * 9.5 + seed, grain[2] * 0.6 + seed * 3.1
             )
             patch = sample_bilinear(
                 materials.noise_texture, grain[2] * 0.9 + seed * 1.7, grain[0] * 2.5 + grain[1] * 3.5 + seed
@@ -195,8 +195,12 @@ def woody_surface(
             clear = 1.0 / (1.0 + pixel * 400.0)
             s.albedo = tint * (1.0 + clear * (0.9 * (rib[2] - 0.5) + 0.5 * (rib[3] - 0.5)) + 0.7 * (patch[1] - 0.5))
             s.albedo = mix(
-                s.albedo, materials.colours.blotch, 0.65 * smoothstep(0.50, 0.72, patch[0] * 0.6 + rib[0] * 0.4)
+                s.albedo, materials.colours.blotch, 0.55 * smoothstep(0.46, 0.74, patch[0] * 0.6 + rib[0] * 0.4)
             )
+            # weathered streaks along the cane
+            share = 0.75 * smoothstep(0.46, 0.62, 0.7 * rib[1] + 0.3 * patch[2])
+            grey = 0.36 * (s.albedo[0] + s.albedo[1] + s.albedo[2])
+            s.albedo = mix(s.albedo, wp.vec3(grey, grey, grey), share)
             s.normal = wp.normalize(n + wp.vec3(rib[1] - 0.5, rib[2] - 0.5, rib[3] - 0.5) * (0.7 * clear))
         s.shininess = 14.0
     elif material == BARK or material == OLD_BARK:

@@ -26,7 +26,7 @@ from vinesim.sensors.raster.primitive_arrays import BOX, CONE, CYLINDER, LEAF
 from vinesim.wires.wire_segments import WireSegments, cut
 
 # Colours [linear RGB reflectance]: all GUESSED by eye, beside photographs of vineyards.
-OLD_BARK_TINT = (0.118, 0.097, 0.080)
+OLD_BARK_TINT = (0.136, 0.116, 0.098)
 BARK_STRIP_TINTS = ((0.15, 0.115, 0.085), (0.23, 0.19, 0.15), (0.09, 0.065, 0.05))
 CUT_TINTS = ((0.27, 0.21, 0.15), (0.19, 0.17, 0.15), (0.11, 0.09, 0.07))
 TENDRIL_TINTS = ((0.17, 0.23, 0.07), (0.24, 0.13, 0.06))
@@ -38,7 +38,7 @@ HOSE_TINT = (0.022, 0.022, 0.024)
 TIE_TINTS = ((0.10, 0.30, 0.12), (0.60, 0.60, 0.56), (0.06, 0.14, 0.32), (0.03, 0.03, 0.03), (0.42, 0.34, 0.20))
 WOODEN_POST_TINTS = ((0.27, 0.20, 0.135), (0.30, 0.275, 0.24), (0.17, 0.135, 0.09))
 CONCRETE_TINT = (0.42, 0.40, 0.365)
-STEEL_TINTS = ((0.37, 0.385, 0.40), (0.21, 0.105, 0.06))
+STEEL_TINTS = ((0.37, 0.385, 0.40), (0.145, 0.092, 0.066))
 """Galvanised, and rusty."""
 
 MAX_STRIPS = 30_000

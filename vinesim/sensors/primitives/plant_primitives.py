@@ -30,13 +30,13 @@ _UNTURNED = 0.42
 """Age from which leaves show yellow margins."""
 
 
-_WAX = 0.9
+_WAX = 0.6
 """Turn of the hue of waxy leaves towards blue, relative to the spread of hues: GUESSED by the share of blue green in
 photographs."""
 NODE_BEFORE = 1.6
 NODE_BEYOND = 0.1
 """Extent of the swelling at a node, before and beyond it, in radii of the cane: GUESSED, by eye."""
-_NODE_WIDTH = 1.3
+_NODE_WIDTH = 1.18
 """Thickness of a node, relative to the cane between nodes: GUESSED, by eye."""
 _RIPE_WOOD = (0.3, 1.1)
 """Range of the share of a shoot, from its base, up to which it is brown at harvest: GUESSED."""
@@ -142,7 +142,7 @@ def _nodes(model: Model, body: np.ndarray, along: np.ndarray, tints: np.ndarray,
         "carrier": body,
         "group": tree,
     }
-    ratio = np.array(model.look.palette.wood.node) / np.array(model.look.palette.wood.cane)
+    ratio = np.sqrt(np.array(model.look.palette.wood.node) / np.array(model.look.palette.wood.cane))
     tint = tints[body] * ratio
     swelling = make_batch(
         CONE,

@@ -188,10 +188,10 @@ def _leaf_texture() -> disk_cache.Arrays:
         fine = _smooth_noise(rng, 3.0)
         wide = _smooth_noise(rng, 9.0)
         net = np.exp(-((fine / 0.25) ** 2))  # areoles: where a band-limited noise crosses zero
-        puffed = 1.0 - np.exp(-((away_from_vein / 0.06) ** 2))  # the blade rises between its veins
-        height = 0.014 * puffed + 0.008 * wide + 0.0016 * fine
+        puffed = 1.0 - np.exp(-((away_from_vein / 0.05) ** 2))  # the blade rises between its veins
+        height = 0.015 * puffed + 0.004 * wide + 0.0018 * fine
         slope_v, slope_u = np.gradient(height, 2.0 / TEXTURE_SIZE)
-        tone = 0.47 + 0.12 * wide + 0.08 * fine + 0.15 * np.exp(-((away_from_vein / 0.024) ** 2))
+        tone = 0.47 + 0.05 * wide + 0.07 * fine + 0.15 * np.exp(-((away_from_vein / 0.024) ** 2))
         for spot_u, spot_v, size in rng.uniform((-0.7, -0.4, 0.008), (0.7, 0.8, 0.03), (6 * (shape % 4 > 1), 3)):
             tone -= 1.3 * np.exp(-((np.hypot(u - spot_u, v - spot_v) / size) ** 4))  # spots of blight
         table[shape] = np.stack([np.maximum(vein, 0.16 * net), slope_u, slope_v, tone], -1)
