@@ -23,6 +23,8 @@ from vinesim.kernels.shading.light_points import (
     unit,
 )
 from vinesim.kernels.shading.materials import (
+    FAR_TONE,
+    FAR_VEIN,
     GRASS,
     Materials,
     berry_occlusion,
@@ -165,7 +167,7 @@ def blade_light(
     t = leaf_texels(int(tables.b[i, 3]), u, v)  # the texture: vein, relief, tone
     near = wp.where(size > pixel * 10.0, 1.0 - grass, 0.0)
     clear = near * wp.clamp(wp.abs(wp.dot(up, d)) * 2.2, 0.0, 1.0) / (1.0 + 3.0 * pixel / size)
-    vein = sampled(tables.leaf_texture, t, 0) * clear
+    vein = sampled(tables.leaf_texture, t, 0) * clear + FAR_VEIN * (1.0 - near)
     seed = tables.c[i, 3]
     spots = texels_around(u * 0.13 + seed * 5.3, v * 0.13 + seed * 2.7)
     hue = sampled(tables.noise, spots, 0)
@@ -177,7 +179,7 @@ def blade_light(
     bumpy = side * slope_u + rib * slope_v + up
     n = unit(mix(bumpy, plain * 0.5 + wp.vec3(0.0, 0.0, 0.8), grass))
     tint = row3(tables.tint, i)
-    tone = 0.5 + near * (sampled(tables.leaf_texture, t, 3) - 0.5)
+    tone = FAR_TONE + near * (sampled(tables.leaf_texture, t, 3) - FAR_TONE)
     albedo = mix(blade_colour(tint, tone, wide, middle, hue), tint * (0.35 + 0.75 * (0.5 + 0.5 * v)), grass)
     colours = materials.colours
     age = wp.max(tables.d[i, 3] - 0.42, 0.0) * 1.7 * (1.0 - grass)
