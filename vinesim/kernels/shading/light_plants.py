@@ -23,6 +23,8 @@ from vinesim.kernels.shading.light_points import (
     unit,
 )
 from vinesim.kernels.shading.materials import (
+    FAR_TONE,
+    FAR_VEIN,
     GRASS,
     Materials,
     berry_occlusion,
@@ -165,25 +167,25 @@ def blade_light(
     t = leaf_texels(int(tables.b[i, 3]), u, v)  # the texture: vein, relief, tone
     near = wp.where(size > pixel * 10.0, 1.0 - grass, 0.0)
     clear = near * wp.clamp(wp.abs(wp.dot(up, d)) * 2.2, 0.0, 1.0) / (1.0 + 3.0 * pixel / size)
-    vein = sampled(tables.leaf_texture, t, 0) * clear
+    vein = sampled(tables.leaf_texture, t, 0) * clear + FAR_VEIN * (1.0 - near)
     seed = tables.c[i, 3]
     spots = texels_around(u * 0.13 + seed * 5.3, v * 0.13 + seed * 2.7)
     hue = sampled(tables.noise, spots, 0)
     wide = sampled(tables.noise, spots, 1)
     middle = sampled(tables.noise, spots, 2)
-    wave = near * (0.5 + 0.9 * trait(seed, 57.77))
+    wave = near * (0.25 + 0.5 * trait(seed, 57.77))
     slope_u += (wide - 0.5) * wave - sampled(tables.leaf_texture, t, 1) * clear
     slope_v += (middle - 0.5) * wave - sampled(tables.leaf_texture, t, 2) * clear
     bumpy = side * slope_u + rib * slope_v + up
     n = unit(mix(bumpy, plain * 0.5 + wp.vec3(0.0, 0.0, 0.8), grass))
     tint = row3(tables.tint, i)
-    tone = 0.5 + near * (sampled(tables.leaf_texture, t, 3) - 0.5)
+    tone = FAR_TONE + near * (sampled(tables.leaf_texture, t, 3) - FAR_TONE)
     albedo = mix(blade_colour(tint, tone, wide, middle, hue), tint * (0.35 + 0.75 * (0.5 + 0.5 * v)), grass)
     colours = materials.colours
     age = wp.max(tables.d[i, 3] - 0.42, 0.0) * 1.7 * (1.0 - grass)
     turned = turned_colour(colours, albedo, age, edge_distance(tables, i, u, v), vein, hue, wide, middle)
     albedo = mix(albedo, turned, wp.where(age > 0.02, 1.0, 0.0))
-    passing = mix(colours.through * (1.0 - 0.45 * vein), wp.vec3(0.7, 0.7, 0.7), grass)
+    passing = mix(colours.through * (1.0 - 0.55 * vein), wp.vec3(0.7, 0.7, 0.7), grass)
     transmission = wp.cw_mul(albedo, passing)
     # the lower side is paler, felted, with raised veins
     under = wp.where(wp.dot(plain, d) > 0.0, 1.0, 0.0)
@@ -191,7 +193,7 @@ def blade_light(
     above = (1.0 - under) * (1.0 - grass)
     felt = mix(albedo * 1.05, colours.under, 0.42)
     albedo = mix(mix(albedo, felt, below), colours.under_vein, below * vein * 0.7)
-    albedo = mix(albedo, colours.vein, above * vein * 0.65)
+    albedo = mix(albedo, colours.vein, above * vein * 0.85)
     gloss = trait(seed, 17.31)
     specular = 0.012 + (0.023 + 0.03 * gloss) * above
     shininess = 12.0 - 6.0 * below + (26.0 * gloss * gloss - 3.0) * above
