@@ -36,7 +36,7 @@ photographs."""
 NODE_BEFORE = 1.6
 NODE_BEYOND = 0.1
 """Extent of the swelling at a node, before and beyond it, in radii of the cane: GUESSED, by eye."""
-_NODE_WIDTH = 1.18
+_NODE_WIDTH = 1.23
 """Thickness of a node, relative to the cane between nodes: GUESSED, by eye."""
 _RIPE_WOOD = (0.3, 1.1)
 """Range of the share of a shoot, from its base, up to which it is brown at harvest: GUESSED."""
