@@ -1,4 +1,4 @@
-"""The bench of picking: tries of single bunches, and their classes."""
+"""The bench of picking (docs/jobs.md): tries of single bunches, and their classes."""
 
 from __future__ import annotations
 

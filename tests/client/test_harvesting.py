@@ -1,4 +1,4 @@
-"""Harvests: which bunch is next, where bunches lie in the crate, and what a robot remembers of what it has seen."""
+"""Harvests (docs/jobs.md): which bunch is next, where bunches lie in the crate, and what a robot remembers."""
 
 from __future__ import annotations
 

@@ -427,6 +427,8 @@ BUNCH_HEIGHT = (1.1, 1.75)
 """[m] Range of heights of a bunch's centre that a hand reaches easily. GUESSED"""
 MAX_PULL = 75.0
 """[N] Largest pull that a chosen bunch may need to come off its vine; a hand pulls with 100 N."""
+MIN_BEND = 0.3
+"""[N m] Least bending strength of a chosen bunch's peduncle. A weaker one breaks when a hand reaches for its bunch."""
 KEPT_AWAY = 2.2
 """Distance of the carrier from the place where the person picks [m]: half the carrier's length, the box, and some steps
 back. GUESSED"""
@@ -453,6 +455,7 @@ def plan_meeting(model: Model, near: np.ndarray, box: int = 0) -> MeetPlan:
     centres = bunch_centres(model)
     height = above_ground(model.terrain, centres)
     fits = (height > BUNCH_HEIGHT[0]) & (height < BUNCH_HEIGHT[1]) & (model.bunch_pull < MAX_PULL)
+    fits &= model.bunch_bend > MIN_BEND
     order = np.argsort(np.linalg.norm(centres[:, :2] - to_box[-1], axis=1), kind="stable")
     for bunch in order[fits[order]].tolist():
         for stand in _standing_places(model, centres[bunch, :2]):

@@ -430,9 +430,8 @@ class Primitives:
             here = np.flatnonzero((carrier == body) & (material == int(materials.FOLIAGE)))
             if len(leaves) and len(here):
                 away = np.linalg.norm(start[here, None, :3] - model.leaf_pose[leaves, :3], axis=-1)
-                nearest = away.argmin(1)
-                on = away[np.arange(len(here)), nearest] < 1e-5
-                place[here[on]] = model.leaf_base[leaves[nearest[on]], 0]
+                # a small leaf stands in the axil of the leaf next to it
+                place[here] = model.leaf_base[leaves[away.argmin(1)], 0]
         return place
 
     def _know(self, rows: list[int]) -> None:
