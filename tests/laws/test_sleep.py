@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import msgspec
@@ -137,7 +138,9 @@ def row_of_canes() -> Model:
 def small_tendone() -> Model:
     scene = load_scene("tendone")
     layout = msgspec.structs.replace(scene.layout, rows=2, vines=2)
-    return generate(msgspec.structs.replace(scene, layout=layout, boxes=(), spawns=()))
+    model = generate(msgspec.structs.replace(scene, layout=layout, boxes=(), spawns=()))
+    # wood that keeps a set would magnify the last bits by which the two runs differ
+    return dataclasses.replace(model, body_strength=np.zeros_like(model.body_strength))
 
 
 @pytest.mark.parametrize(
