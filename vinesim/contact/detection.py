@@ -216,7 +216,8 @@ class ContactDetection:
             tied: whether the piece's own ties hold the stump now.
         """
         shapes = self.arrays.capsules
-        geom, at = shapes.tied_geom, shapes.tied_joint
+        geom = shapes.tied_geom
+        at = shapes.tied_joint
         body = int(shapes.body[capsule])
         own = at[capsule] < 0
         above = at[capsule] == body

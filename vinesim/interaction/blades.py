@@ -180,7 +180,8 @@ class Blade:
         first = int(too_much[0])
         if first == 0:
             return self.gap, True
-        low, high = gaps[first], gaps[first - 1]
+        low = gaps[first]
+        high = gaps[first - 1]
         for _ in range(40):
             middle = 0.5 * (low + high)
             is_possible = self._needed(np.array([middle]), energy_share)[0] <= self.force
@@ -210,7 +211,8 @@ class Blade:
         room = self._uncut(start) - SAW_RATE * dt
         if self._uncut(goal) >= room:
             return goal, False
-        low, high = goal, start
+        low = goal
+        high = start
         for _ in range(40):
             middle = 0.5 * (low + high)
             low, high = (low, middle) if self._uncut(middle) >= room else (middle, high)

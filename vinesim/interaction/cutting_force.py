@@ -129,7 +129,8 @@ def _power(share: float) -> float:
     :class:`ValueError` unless the share is between 0.01 and 1."""
     if not 0.01 <= share < 1.0:
         raise ValueError(f"a cutting energy of {share} of force times diameter; give 0.01 to 1")
-    low, high = 0.0, 1e4
+    low = 0.0
+    high = 1e4
     for _ in range(200):
         middle = 0.5 * (low + high)
         integral = math.exp(middle * math.log(4.0) + 2.0 * math.lgamma(middle + 1.0) - math.lgamma(2.0 * middle + 2.0))

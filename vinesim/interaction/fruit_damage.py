@@ -228,7 +228,8 @@ class FruitMonitor:
         solver = self.contact_solver
         n = solver.count
         contacts = solver.impulses.contacts
-        other_body, other = contacts.other_body[:n], contacts.other[:n]
+        other_body = contacts.other_body[:n]
+        other = contacts.other[:n]
         one = self._bunch_of[contacts.body[:n]]
         two = np.where(other_body >= 0, self._bunch_of[other_body], -1)
         kind = np.full(n, _STATIC)
@@ -245,7 +246,8 @@ class FruitMonitor:
 
     def _rigid_contacts(self) -> list[tuple[np.ndarray, ...]]:
         """Contacts of free bunches with robots, people, boxes, the ground and each other."""
-        m, d = self.rigid.mj_model, self.rigid.mj_data
+        m = self.rigid.mj_model
+        d = self.rigid.mj_data
         if d.ncon == 0:
             return []
         contact = d.contact

@@ -144,7 +144,8 @@ def _removed(nodes: Nodes, canes: DormantCanes, cane: int) -> Cut:
 
 def placed(model: Model, cut: Cut) -> Cut:
     """Returns the cut with a place within its body: beyond the end of a body, the place is in the next one."""
-    body, along = cut.body, cut.along
+    body = cut.body
+    along = cut.along
     last = int(model.canes.body[cut.cane] + model.canes.size[cut.cane]) - 1
     while along > float(model.body_length[body]) and body < last:
         along -= float(model.body_length[body])
@@ -198,7 +199,8 @@ def _stops_of_vine(
     row = np.linalg.svd(spread, full_matrices=False)[2][0] if len(points) > 2 else np.array([1.0, 0.0])
     across = np.array([-row[1], row[0]])
     if (near - points.mean(0)) @ across > 0.0:  # the robot drives with the row to its left
-        row, across = -row, -across
+        row = -row
+        across = -across
     heading = float(np.arctan2(row[1], row[0]))
     groups: dict[int, list[Cut]] = {}
     for cut in cuts:

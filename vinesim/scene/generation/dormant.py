@@ -218,9 +218,11 @@ def _find_ties(
     trellis = parameters.trellis
     flat = build_bodies(parameters, level.shoots)
     found = find_ties(scene, parameters, level.structure, level.shoots, flat)
-    shoot, slot = found["shoot"], found["slot"]
+    shoot = found["shoot"]
+    slot = found["slot"]
     share = found["point"][:, :1] / flat.length[shoot, slot][:, None]
-    start, end = vines.shoots.points[shoot, slot], vines.shoots.points[shoot, slot + 1]
+    start = vines.shoots.points[shoot, slot]
+    end = vines.shoots.points[shoot, slot + 1]
     body = canes.first[shoot] + slot
     point = share * np.linalg.norm(end - start, axis=1, keepdims=True) * [1.0, 0.0, 0.0]
     anchor = start + share * (end - start)
@@ -271,7 +273,8 @@ def _place_nodes(scene: Scene, vines: Vines, canes: _Canes, state: SeasonState) 
             bearer = bearers[cane]
             length = np.linalg.norm(np.diff(bearer.points, axis=0), axis=1)
             many = len(length)
-            body, along = first + np.arange(many), length
+            body = first + np.arange(many)
+            along = length
             for shoot, at in zip(bearer.shoots, bearer.at, strict=True):
                 table.node[canes.cane[shoot]] = count + at - 1
             part = {"bud": np.zeros(many, bool)}
@@ -284,7 +287,8 @@ def _place_nodes(scene: Scene, vines: Vines, canes: _Canes, state: SeasonState) 
             place = place[place < 0.995] * way[-1]
             many = len(place)
             piece = np.minimum(np.searchsorted(way, place, "right") - 1, AXIS_SEGMENTS - 1)
-            body, along = first + piece, place - way[piece]
+            body = first + piece
+            along = place - way[piece]
             g = rngs[int(table.vine[cane])]
             turn = frames.from_x_axis(np.diff(points, axis=0), shoots.up[shoot])[piece]
             axis = frames.rotate(turn, np.array([1.0, 0.0, 0.0]))

@@ -41,7 +41,8 @@ def view_of_node(
         if not finder.is_free(pose, entry, values["distance"]):
             continue
         seen = ground_truth.render_buffers(finder.primitives, info, pose)
-        organ, index = seen.labels // LABEL_STRIDE, seen.labels % LABEL_STRIDE
+        organ = seen.labels // LABEL_STRIDE
+        index = seen.labels % LABEL_STRIDE
         shown = (organ == Organ.NODE) & (index == node) | (organ == Organ.BUD) & (index == nodes.bud[node])
         if shown.any() and not finder.is_obstructed(seen):
             return seen, {"node": node, "side": side, **values}
@@ -56,7 +57,8 @@ def node_records(model: Model, snapshot: Snapshot, seen: PixelBuffers) -> list[d
     rank from the base of the cane, position [m] in the world, pixel [column, row] of the node, and numbers of pixels.
     """
     nodes = model.nodes
-    organ, index = seen.labels // LABEL_STRIDE, seen.labels % LABEL_STRIDE
+    organ = seen.labels // LABEL_STRIDE
+    index = seen.labels % LABEL_STRIDE
     node_pixels = np.bincount(index[organ == Organ.NODE], minlength=len(nodes.body))
     bud_pixels = np.bincount(index[organ == Organ.BUD], minlength=int(nodes.bud.max(initial=-1)) + 1)
     has = nodes.bud >= 0

@@ -204,7 +204,8 @@ def _wood(model: Model, yard: _Vineyard, rng: np.random.Generator, place: np.nda
     organ.append(Organ.POLE)
     tints.append(np.array(model.look.palette.wood.post) * rng.uniform(0.8, 1.1, (len(post), 1)))
     organs = np.repeat([int(one) for one in organ], [len(part) for part in a])
-    start, end = np.concatenate(a), np.concatenate(b)
+    start = np.concatenate(a)
+    end = np.concatenate(b)
     return make_batch(
         CONE,
         stack_columns(start, np.concatenate(ra)),
@@ -283,7 +284,8 @@ def _wires(model: Model, yard: _Vineyard, rng: np.random.Generator, place: np.nd
         end.append(ends[1])
         radius.append(np.full(len(ends[0]), thick))
         material.append(np.full(len(ends[0]), int(kind)))
-    thick, kinds = np.concatenate(radius), np.concatenate(material)
+    thick = np.concatenate(radius)
+    kinds = np.concatenate(material)
     is_wire = kinds[:, None] == int(materials.WIRE)
     return make_batch(
         CONE,
@@ -415,7 +417,8 @@ def _grass(
     """Returns tufts of grass and weeds of uneven height between and below the distant rows, and the tall grass of
     meadows on sides that are open [4]; they have the ground's label."""
     colours = model.look.palette.ground
-    low, high = yard.low - _GRASS_REACH, yard.high + _GRASS_REACH
+    low = yard.low - _GRASS_REACH
+    high = yard.high + _GRASS_REACH
     spot = low + (high - low) * rng.uniform(size=(4 * MAX_TUFTS, 2))
     away = _away(yard, spot)
     outside = np.stack([yard.low - spot, spot - yard.high], 2).reshape(-1, 4)  # as the order of sides
@@ -497,7 +500,8 @@ def _trees(
     near = np.where(is_open[side], _TREES[0], REACH + 4.0)
     off = near + np.maximum(_TREES[1] - near, 8.0) * rng.uniform(size=count) ** 1.5
     along = rng.uniform(-1.0, 1.0, count)
-    middle, half = 0.5 * (yard.low + yard.high), 0.5 * (yard.high - yard.low)
+    middle = 0.5 * (yard.low + yard.high)
+    half = 0.5 * (yard.high - yard.low)
     axis = side // 2
     sign = np.where(side % 2, 1.0, -1.0)
     place = np.empty((count, 2))
