@@ -138,8 +138,7 @@ def test_shears_in_a_hand_that_opens_early_leave_a_partial_cut_that_weakens_the_
     assert depth == pytest.approx(0.5, abs=0.01)
     monitor = physics.detachment_monitor
     pull, bend = remaining_strength(depth)
-    assert monitor._pull[0] == pytest.approx(pull * physics.model.bunch_pull[0])
-    assert monitor._bend[0] == pytest.approx(bend * physics.model.bunch_bend[0])
+    assert monitor.wood.left[0] == pytest.approx((pull, bend))
     assert physics.plants.held_bodies == []
 
 

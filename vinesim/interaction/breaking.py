@@ -90,6 +90,8 @@ class WoodMonitor:
         self._load_time = np.zeros(bunches)
         self._used_before = np.zeros(bunches)
         self._any_held = False
+        self.left = np.ones((bunches, 2))
+        """[bunch, 2] Shares of the strengths of peduncles in tension and bending that cuts in part have left."""
         self._wrenches: dict[int, tuple[int, int, np.ndarray]] = {}
         """Tick, body and wrench of the overloaded end of each overloaded bunch in the last step."""
         self.law = BendingLaw.of(
@@ -281,6 +283,7 @@ class WoodMonitor:
     def weaken(self, bunch: int, pull: float, bend: float) -> None:
         """Leave a peduncle, which is cut in part, the shares ``pull`` and ``bend`` [1] of its strength."""
         model = self.plants.model
+        self.left[bunch] = pull, bend
         slots = self.plants.buffers.slots[self._ends[bunch]]
         for values, strength in (
             (self._strengths.pull, pull * model.bunch_pull[bunch]),
