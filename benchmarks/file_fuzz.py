@@ -409,7 +409,7 @@ def _recording(folder: pathlib.Path) -> Kind:
             playhead = Playhead(recording)
             playhead.play(recording.start + recording.length)
         if "\n" in recording.damage:
-            raise WrongContent("the damage is told in several lines")
+            raise WrongContent("the message about the damage has several lines")
         return not recording.damage
 
     return Kind(".mcap", tuple(samples), read, (InvalidRecording,), is_text=False)
@@ -441,7 +441,7 @@ def _bag(folder: pathlib.Path) -> Kind:
             if (at, data) not in {one[1:] for one in allowed} and bag.topics.keys() <= topics:
                 raise WrongContent(f"a message of {topic!r} with {len(data)} bytes was never written")
         if "\n" in bag.damage:
-            raise WrongContent("the damage is told in several lines")
+            raise WrongContent("the message about the damage has several lines")
         return not bag.damage
 
     return Kind(".bag", tuple(samples), read, (BagError,), is_text=False)

@@ -51,7 +51,8 @@ LEAST_DROP = 0.02
 LEAST_FLIGHT = 0.03
 """[s] Shortest time without contact that counts as a fall."""
 
-_STATIC, _ACTOR = -1, -2
+_STATIC = -1
+_ACTOR = -2
 
 
 def burst_force(radius: float | np.ndarray, tension: float) -> float | np.ndarray:
@@ -158,7 +159,10 @@ class FruitMonitor:
         tree_is_remote = self.contact_solver.remote_trees[model.body_tree[model.bunch_body[bunch]]]
         mine = ~np.where(hangs, tree_is_remote, self.remote[bunch])
         mine &= (force > 0.0) & (by_actor | ~hangs | (self._row[bunch] >= 0))
-        bunch, force, point, by_actor = bunch[mine], force[mine], point[mine], by_actor[mine]
+        bunch = bunch[mine]
+        force = force[mine]
+        point = point[mine]
+        by_actor = by_actor[mine]
         if len(bunch) == 0:
             return bunch
         self._add_rows(bunch)

@@ -274,7 +274,10 @@ def _wires(model: Model, yard: _Vineyard, rng: np.random.Generator, place: np.nd
     lines = [(height, 0.0015, materials.WIRE, np.ones(len(place), bool)) for height in heights]
     lines.append((rng.uniform(0.32, 0.48), 0.008, materials.RUBBER, has_hose[row]))
     half = 0.5 * yard.vine_spacing
-    start, end, radius, material = [], [], [], []
+    start = []
+    end = []
+    radius = []
+    material = []
     for height, thick, kind, shown in lines:
         ends = []
         for side in (-half, half):
@@ -430,7 +433,11 @@ def _grass(
     share = np.where(meadow, 1.0, share) * np.clip(5.0 / np.maximum(away, 1.0), 0.15, 1.0)
     kept = (away > _SCENE_GRASS) & (away < _GRASS_REACH) & (rng.uniform(size=len(spot)) < share)
     kept = np.flatnonzero(kept)[:MAX_TUFTS]
-    spot, away, meadow, below, noise = spot[kept], away[kept], meadow[kept], below[kept], noise[kept]
+    spot = spot[kept]
+    away = away[kept]
+    meadow = meadow[kept]
+    below = below[kept]
+    noise = noise[kept]
     n = len(spot)
     if not n:
         return []
