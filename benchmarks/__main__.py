@@ -137,7 +137,7 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
     ),
     "coverage": (
         _coverage,
-        "share of fits whose 90 % interval contains the true value, for canes and bunches",
+        "share of fits whose 90 %% interval contains the true value, for canes and bunches",
         {
             "seeds": {"type": int, "default": 50, "help": "number of fits of each plant"},
             "first": {"type": int, "default": 0, "help": "first seed"},
