@@ -33,19 +33,21 @@ def _asleep() -> Iterator[Measurement]:
     return _call("vineyard:sleeping_measurements")(load_description("vinebot").to_spec("robot"))
 
 
-def _picking(by: str, seeds: int, first: int, record: pathlib.Path | None) -> Iterator[Measurement]:
-    if seeds < 1:
-        raise UsageError(f"--seeds is {seeds}: give 1 or more")
-    if first < 0:
-        raise UsageError(f"--first is {first}: give 0 or more")
-    return _call("picking:picking")(by, range(first, first + seeds), record, _announce)
+def _picking(by: str, seeds: int, first: int, record: pathlib.Path | None, jobs: int) -> Iterator[Measurement]:
+    _require(("seeds", seeds, 1), ("first", first, 0), ("jobs", jobs, 1))
+    return _call("picking:picking")(by, range(first, first + seeds), record, jobs, _announce)
 
 
-def _pruning(seeds: int, first: int, spurs: int, record: pathlib.Path | None) -> Iterator[Measurement]:
-    for option, value, least in (("seeds", seeds, 1), ("first", first, 0), ("spurs", spurs, 0)):
+def _pruning(seeds: int, first: int, spurs: int, record: pathlib.Path | None, jobs: int) -> Iterator[Measurement]:
+    _require(("seeds", seeds, 1), ("first", first, 0), ("spurs", spurs, 0), ("jobs", jobs, 1))
+    return _call("pruning:pruning")(range(first, first + seeds), spurs, record, jobs, _announce)
+
+
+def _require(*options: tuple[str, int, int]) -> None:
+    """Raise :class:`UsageError` for the first option, as name, value and least value, that is too small."""
+    for option, value, least in options:
         if value < least:
             raise UsageError(f"--{option} is {value}: give {least} or more")
-    return _call("pruning:pruning")(range(first, first + seeds), spurs, record, _announce)
 
 
 def _kill(times: int, seed: int) -> Iterator[Measurement]:
@@ -108,6 +110,7 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
             "seeds": {"type": int, "default": 1, "help": "number of vineyards"},
             "first": {"type": int, "default": 7, "help": "seed of the first vineyard"},
             "record": {"type": pathlib.Path, "help": "file of results by seed; seeds that it has are not run again"},
+            "jobs": {"type": int, "default": 1, "help": "number of processes, each with a seed at a time"},
         },
     ),
     "pruning": (
@@ -118,6 +121,7 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
             "first": {"type": int, "default": 1, "help": "seed of the first vineyard"},
             "spurs": {"type": int, "default": 0, "help": "largest number of spurs of each vine; 0: all"},
             "record": {"type": pathlib.Path, "help": "file of results by seed; seeds that it has are not run again"},
+            "jobs": {"type": int, "default": 1, "help": "number of processes, each with a seed at a time"},
         },
     ),
     "sensors": (

@@ -3,21 +3,21 @@
 Each seed is a vineyard; the robot prunes the vine nearest to its start place, with poses of canes from the simulation.
 Measured are the cuts that were made, their distance from the wanted places, other canes that were cut, the largest
 force on a bud of the kept spurs, and the seconds. ``--record FILE`` keeps a line of JSON for each seed, so that a long
-run can be continued.
+run can be continued. ``--jobs N`` runs seeds in N processes.
 """
 
 from __future__ import annotations
 
 import collections
-import json
+import functools
 import math
 import pathlib
-import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
+from benchmarks.support.seed_runs import SeedRuns
 from vinesim.api.picking import ROBOT
 from vinesim.client.tasks.pruning import PruningRule, plan_pruning
 from vinesim.client.tasks.start_poses import spawn_pose
@@ -39,24 +39,17 @@ LARGEST_FORCE = 5.0
 
 
 def pruning(
-    seeds: Sequence[int], spurs: int, record: pathlib.Path | None, announce: Callable[[str], None]
+    seeds: Sequence[int], spurs: int, record: pathlib.Path | None, jobs: int, announce: Callable[[str], None]
 ) -> Iterator[Measurement]:
-    """Measure cuts, kept canes and buds, and seconds. ``spurs``: largest number of spurs of each vine, 0: all."""
-    known = {}
-    if record is not None and record.exists():
-        known = {one["seed"]: one for one in map(json.loads, record.read_text().splitlines()) if one["spurs"] == spurs}
-    lines = []
-    for seed in seeds:
-        line = known.get(seed)
-        if line is None:
-            start = time.monotonic()
-            line = prune_one(seed, spurs)
-            announce(f"seed {seed}: {line['right']} of {line['wanted']} cuts, {time.monotonic() - start:.0f} s")
-            if record is not None:
-                with record.open("a") as file:
-                    file.write(json.dumps(line) + "\n")
-        lines.append(line)
-    yield from measurements(lines)
+    """Measure cuts, kept canes and buds, and seconds. ``spurs``: largest number of spurs of each vine, 0: all.
+    ``jobs``: number of processes."""
+    work = functools.partial(prune_one, spurs=spurs)
+    runs = SeedRuns(work, {"benchmark": "pruning", "spurs": spurs}, _summary, announce, record)
+    yield from measurements(runs.lines(seeds, jobs))
+
+
+def _summary(line: dict[str, Any]) -> str:
+    return f"{line['right']} of {line['wanted']} cuts"
 
 
 def prune_one(seed: int, spurs: int) -> dict[str, Any]:
@@ -82,8 +75,6 @@ def prune_one(seed: int, spurs: int) -> dict[str, Any]:
     kept = kept_buds(model, stops, rule.buds)
     wanted = {cut.cane for stop in stops for cut in stop.cuts}
     return {
-        "seed": seed,
-        "spurs": spurs,
         "wanted": len(task.results),
         "made": sum(one.done for one in task.results),
         "right": sum(one.done and one.off <= LARGEST_ERROR for one in task.results),
