@@ -29,7 +29,18 @@ from vinesim.robot.tasks.task import Task, TaskFailed
 from vinesim.world import Physics
 
 STALK_LENGTH = 0.012
-"""[m] Length of the stalk that stays on the bunch."""
+"""[m] Least length of the stalk that stays on the bunch; see :func:`stalk_length`."""
+SHOULDER = -0.032, 0.916, -0.106
+"""[m, 1, 1] Height of a bunch's shoulders above its upper end, 20 mm beside the stalk, where the bars of the cutter pass:
+a constant, and shares of its radius and of its length. DERIVED: least squares over the collision shapes of the 199
+bunches of ``demo`` (seed 0) and ``harvest`` (seed 7), right within 2.7 mm."""
+SHOULDER_ROOM = 0.009
+"""[m] Distance of the cutter's plane above the shoulders: half a bar (3 mm), the error of :data:`SHOULDER`, and the
+error of the hand (3 mm)."""
+STALK_FORCE = 150.0
+"""[N] Largest force of the blades at a stalk. Peduncles of 3 to 5.6 mm take 34 to 118 N
+(:data:`vinesim.interaction.cutting_force.PEDUNCLE_STRENGTH`). Blades with this force stall in canes of 3.8 mm and
+more."""
 OPENING_MARGIN = 0.015
 """[m] Gap between the open fingers and the bunch, on each side. GUESSED"""
 APPROACH_DISTANCE = 0.20
@@ -71,6 +82,13 @@ MAX_SLIP = 0.12
 """[m] Distance between bunch and hand above which the bunch has slipped out of the fingers. GUESSED"""
 
 
+def stalk_length(radius: float, length: float) -> float:
+    """Returns the length [m] of the stalk to leave on a bunch of this ``radius`` and ``length`` [m]: the bars of the
+    cutter pass above its shoulders."""
+    constant, of_radius, of_length = SHOULDER
+    return max(STALK_LENGTH, constant + of_radius * radius + of_length * length + SHOULDER_ROOM)
+
+
 @dataclasses.dataclass(frozen=True)
 class PickPlan:
     """Plan of the task: which bunch to pick, with which arm, from where, and into which box."""
@@ -109,13 +127,12 @@ class PickBunch(Task):
         if cutter is None:
             raise CommandError(f"{robot.name} has no gripper with a cutter on its {plan.side} arm; give another robot")
         self._cutter = cutter.frame
-        self._length, self._radius = self._size()
+        self._above = float(np.linalg.norm(robot.frame_pose(self._cutter)[:3] - robot.frame_pose(self.arm.tool)[:3]))
+        """[m] Distance of the cutter above the point between the fingers."""
+        self._measure()
         self._is_empty = False
         """Whether the hand is to hold no bunch any more, after a failure."""
         self._fingers = robot.description.joint_indices(self.arm.gripper)
-        above = np.linalg.norm(robot.frame_pose(self._cutter)[:3] - robot.frame_pose(self.arm.tool)[:3])
-        self._grasp_depth = min(float(above) - STALK_LENGTH, 0.6 * self._length)
-        """[m] Distance from the upper end of the bunch down to the point where it is grasped."""
         self._tool_z = np.array([0.0, 0.0, 1.0])
 
     @property
@@ -138,6 +155,13 @@ class PickBunch(Task):
         """Returns length and radius of the bunch [m]."""
         model = self.physics.model
         return float(model.bunch_length[self.plan.bunch]), float(model.bunch_radius[self.plan.bunch])
+
+    def _measure(self) -> None:
+        """Set the size of the bunch, and where it is grasped."""
+        self._length, self._radius = self._size()
+        stalk = stalk_length(self._radius, self._length)
+        self._grasp_depth = min(self._above - stalk, 0.6 * self._length)
+        """[m] Distance from the upper end of the bunch down to the point where it is grasped."""
 
     @property
     def mass(self) -> float:
@@ -233,7 +257,7 @@ class PickBunch(Task):
     def _cut(self) -> Iterator[str]:
         """Close the cutter, repeatedly until the bunch is cut off."""
         for _ in range(MAX_CUTS):
-            self.robot.command_cutter(self.arm.gripper)
+            self.robot.command_cutter(self.arm.gripper, STALK_FORCE)
             yield "cut"
             while any(blade.closing for blade in self.robot.cutter_blades(self.arm.gripper)):
                 yield "cut"
