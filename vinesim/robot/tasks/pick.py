@@ -31,9 +31,9 @@ from vinesim.world import Physics
 STALK_LENGTH = 0.012
 """[m] Least length of the stalk that stays on the bunch; see :func:`stalk_length`."""
 SHOULDER = -0.032, 0.916, -0.106
-"""[m, 1, 1] Height of a bunch's shoulders above its upper end, 20 mm beside the stalk, where the bars of the cutter pass:
-a constant, and shares of its radius and of its length. DERIVED: least squares over the collision shapes of the 199
-bunches of ``demo`` (seed 0) and ``harvest`` (seed 7), right within 2.7 mm."""
+"""[m, 1, 1] Height of a bunch's shoulders above its upper end, 20 mm beside the stalk, where the bars of the cutter
+pass: a constant, and shares of its radius and of its length. DERIVED: least squares over the collision shapes of the
+199 bunches of ``demo`` (seed 0) and ``harvest`` (seed 7), right within 2.7 mm."""
 SHOULDER_ROOM = 0.009
 """[m] Distance of the cutter's plane above the shoulders: half a bar (3 mm), the error of :data:`SHOULDER`, and the
 error of the hand (3 mm)."""
