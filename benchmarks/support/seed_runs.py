@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import multiprocessing
 import pathlib
+import threading
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -16,6 +18,8 @@ from vinesim.kernels.compilation import PHYSICS_PACKAGES, SENSOR_PACKAGES, compi
 
 Line = dict[str, Any]
 """Result of one seed as plain values; a line of the file."""
+_interrupted = threading.Event()
+"""Set in a process that Ctrl-C has reached: its pool still gives it the seeds that wait in its queue."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,8 +50,15 @@ class SeedRuns:
 
     def __call__(self, seed: int) -> Line:
         """Run one seed, record its line and return it. ``cpu_seconds`` is the time of the processor that it took."""
+        if _interrupted.is_set():
+            raise KeyboardInterrupt
         start = time.process_time()
-        line = self.case | {"seed": seed} | self.work(seed)
+        try:
+            line = self.case | {"seed": seed} | self.work(seed)
+        except KeyboardInterrupt:
+            if multiprocessing.parent_process() is not None:
+                _interrupted.set()
+            raise
         line["cpu_seconds"] = round(time.process_time() - start, 1)
         if self.record is not None:
             # one write of a whole line at the end of the file: processes do not mix their lines
