@@ -52,6 +52,8 @@ def plan_task(
     """
     if validate_task_name(job) == "pick":
         options = harvest or HarvestOptions()
+        if not len(model.bunch_body):
+            raise PlacementError("this vineyard has no bunch to pick; raise fruit.bunches in its scene file")
         if eyes is not None:
             if next(box_approaches(model), None) is None:
                 raise PlacementError(NO_BOX)

@@ -46,9 +46,10 @@ OPENING_MARGIN = 0.015
 APPROACH_DISTANCE = 0.20
 """[m] Length of the straight motion towards the bunch before the grasp, and of the straight motion back after it.
 GUESSED"""
-GRASP_FORCE = 25.0
-"""[N] Force of each finger. A bunch of 1 kg needs 6 N at a friction coefficient of 0.8; the rest is for
-accelerations."""
+GRASP_FORCE = 15.0
+"""[N] Force of each finger. A bunch of 1 kg needs 6 N at a friction coefficient of 0.8; the rest is for accelerations.
+More would burst berries: on one cell of a bunch, the weakest of a table grape burst from 16 N on
+(:data:`vinesim.interaction.fruit_damage.SKIN_TENSION`)."""
 MIN_GRASP_FORCE = 8.0
 """[N] Contact force on each finger from which on the fingers have grasped something. GUESSED"""
 GRASP_TIME = 0.3
