@@ -37,6 +37,8 @@ TIME_LIMIT = 120.0
 
 PRUNING_TIME = 400.0
 """Default limit of the simulated time of pruning one vine [s]."""
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
 SETTLE_TIME = 2.0
 """Time after the time-out of a task itself [s], so that its own reason is reported."""
 
@@ -55,7 +57,8 @@ def run_job(
     headless: bool,
     out: pathlib.Path,
 ) -> int:
-    """Let one robot do a task, and write the results into ``out``. Returns 0 if the task was done, 5 otherwise."""
+    """Let one robot do a task, and write the results into ``out``. Returns 0 if the task was done, :data:`INTERRUPTED`
+    after Ctrl-C, 5 otherwise."""
     if job not in JOBS:
         raise UnknownTask(f"no job {job!r}; give push, {', '.join(list(JOBS)[:-1])} or {list(JOBS)[-1]}")
     console = Console(stderr=True, markup=False)
@@ -116,7 +119,12 @@ def run_job(
             "1",
         )
         newest[PICKER] = json.loads(picker.next_line(START_TIMEOUT))
-        show_progress(picker, visitor, server, newest, console, headless)
+        is_stopped = False
+        try:
+            show_progress(picker, visitor, server, newest, console, headless)
+        except KeyboardInterrupt:  # the programs end in order, and the summary tells how far the task came
+            is_stopped = True
+            picker.finish()
         if visitor is not None:
             visitor.finish()
     summary = job_summary(
@@ -139,7 +147,7 @@ def run_job(
             f"{summary['visitor']['bunches_picked']} of {summary['bunches_picked']} bunches off their vines"
         )
     console.print(f"pictures and summary.json are in {out}/")
-    return 0 if done else 5
+    return INTERRUPTED if is_stopped else 0 if done else 5
 
 
 def time_limit(job: str, harvest: HarvestOptions, see: bool) -> float:
