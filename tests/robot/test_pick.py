@@ -134,7 +134,7 @@ def test_a_failed_cut_is_reported_with_the_reason(vinebot: RobotDescription, mon
     model, task = vineyard(7)
     physics = Physics(model)
     robot = picker(physics, vinebot, task.base_pose)
-    monkeypatch.setattr(robot, "command_cutter", lambda group: None)
+    monkeypatch.setattr(robot, "command_cutter", lambda group, force: None)
     pick = run(PickBunch(physics, robot, task))
     assert not pick.picked
     assert pick.reason.startswith("cut: the blades missed the stalk")
