@@ -55,6 +55,7 @@ class RigidBatch:
         self._mjw = _mujoco_warp()
         m = copy.copy(rigid.mj_model)
         m.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+        m.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # mujoco_warp never resets by itself
         rigid.update_kinematics()
         limits = int(m.jnt_limited.sum() + m.neq * ROWS_PER_CONTACT + (m.dof_frictionloss > 0.0).sum())
         with wp.ScopedDevice(self.device):
