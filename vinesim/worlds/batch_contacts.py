@@ -23,7 +23,7 @@ from vinesim.kernels.worlds.dense_solver import WorldSearch, WorldSystem
 from vinesim.kernels.worlds.views import GROUP
 from vinesim.kernels.graph import THREADS_PER_BLOCK, KernelGraph, KernelLaunch
 from vinesim.kernels.plants import structs as plant_structs
-from vinesim.kernels.worlds import contact_step, delassus, narrowphase, rigid_state
+from vinesim.kernels.worlds import contact_step, delassus, narrowphase, reset, rigid_state
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.plants.device_buffers import WARP_SIZE
 from vinesim.rigid.collision_geoms import PLANE_HALF_SIZE
@@ -556,6 +556,12 @@ class BatchContacts:
                 )
             )
         return launches
+
+    def forget(self, resets: wp.array) -> KernelLaunch:
+        """Returns the launch after which the next step of some worlds begins without contacts. ``resets``: bool
+        [world], which worlds."""
+        given = (resets, self._world_contacts, self._warm_start)
+        return self._launch(reset.forget_contacts, self.worlds, *given)
 
     def solve(self) -> None:
         """Launch the kernels of the contacts of one step. An argument of :meth:`ArticulationSolver.advance`, which

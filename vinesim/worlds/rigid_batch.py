@@ -120,6 +120,11 @@ class RigidBatch:
         """[world, dof] N or N m: generalised forces of the contacts with plants."""
         return self.data.qfrc_applied
 
+    def state_arrays(self) -> list[wp.array]:
+        """Returns the arrays [world, k] of single-precision numbers that are the state of robots and boxes."""
+        data = self.data
+        return [data.qpos, data.qvel, data.qacc, data.qacc_warmstart, data.act, data.ctrl, data.qfrc_applied]
+
     def fill(self, struct: Any) -> Any:
         """Returns a Warp struct whose fields are arrays of mujoco_warp with the same names."""
         made = struct()

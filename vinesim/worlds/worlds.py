@@ -13,7 +13,10 @@ from collections.abc import Sequence
 
 import msgspec
 import numpy as np
+import warp as wp
 
+from vinesim.kernels.graph import KernelGraph, KernelLaunch
+from vinesim.kernels.worlds.reset import restore_bodies, restore_worlds
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene.model import Model
@@ -25,6 +28,14 @@ from vinesim.worlds.rigid_batch import RigidBatch
 
 DEFAULT_SLOTS = 16
 """Default for the number of contacts that the plants of one world can have at once."""
+_BODY_STATE = ("joint_q", "joint_qd", "body_q", "body_qd", "body_qd_free", "body_wrench", "body_acceleration")
+"""Arrays with a row for each body that change in a step and that the next step reads."""
+
+
+def _as_table(rows: wp.array) -> wp.array:
+    """Returns an array of vectors, quaternions or poses as a table of numbers that shares its memory."""
+    width = rows.strides[0] // 4
+    return wp.array(ptr=rows.ptr, shape=(len(rows), width), dtype=float, device=rows.device)
 
 
 class Worlds:
@@ -70,6 +81,34 @@ class Worlds:
         self.contacts = BatchContacts(self.plants, parameters, slots=slots, bodies=self.bodies)
         """Contacts of the plants."""
         self.plants.upload()
+        self._resets = wp.zeros(count, dtype=wp.bool, device=device)
+        self._reset = self._reset_graph(device)
+
+    def _reset_graph(self, device: str) -> KernelGraph:
+        """Returns the launches that return worlds to the states that they have now."""
+        arrays = self.plants.launches.resident_arrays
+        launches = []
+        for name in _BODY_STATE:
+            rows = _as_table(arrays[name])
+            given = [self.count, self._resets, arrays["body_tree"], wp.clone(rows)]
+            launches.append(KernelLaunch(restore_bodies, given, [rows], threads=rows.shape[0], width=rows.shape[1]))
+        bodies = self.bodies
+        for rows in (*bodies.state_arrays(), bodies.targets, bodies.base_velocity, bodies.base_targets):
+            if rows.size:
+                given = [self._resets, wp.clone(rows)]
+                launches.append(KernelLaunch(restore_worlds, given, [rows], threads=self.count, width=rows.shape[1]))
+        return KernelGraph(*launches, self.contacts.forget(self._resets), device=device)
+
+    def reset(self, worlds: np.ndarray | wp.array | None = None) -> None:
+        """Return worlds to their first states, with the targets that their robots had then.
+
+        ``worlds``: bool [world], whether each world is reset; None: all are. Between two calls of :meth:`step`.
+        """
+        if worlds is None:
+            self._resets.fill_(True)
+        else:
+            self._resets.assign(worlds)
+        self._reset()
 
     @property
     def dt(self) -> float:
