@@ -579,6 +579,10 @@ class BatchContacts:
 
     # ------------------------------------------------------------------ results
 
+    def lists(self) -> tuple[structs.Contacts, narrowphase.WorldContacts]:
+        """Returns the contacts of the last step, for kernels: entry i of a world is at ``i * worlds + world``."""
+        return self.contacts, self._world_contacts
+
     @property
     def count(self) -> np.ndarray:
         """[world] Number of contacts in the last step, including contacts without force."""
