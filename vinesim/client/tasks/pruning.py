@@ -24,9 +24,10 @@ from vinesim.scene.model import Model
 from vinesim.scene.nodes import DormantCanes, Nodes
 from vinesim.scene.terrain import on_ground
 
-REMOVED_AT = 0.5
-"""Place at which a cane is removed, as a share of the way from its base to its first node. GUESSED: pruners leave a
-collar of about a centimetre, in which the wood dries back."""
+REMOVED_AT = 0.7
+"""Place at which a cane is removed, as a share of the way from its base to its first node. GUESSED: the wood dries back
+over two to three diameters, so that about 3 cm are left; the blades are then beside no bud of the other cane of a spur,
+which stands an internode higher or lower."""
 ABOVE_BUD = 0.015
 """[m] Distance of a cut above the last bud that is kept. Handbooks ask for one to two centimetres; GUESSED."""
 ROW_DISTANCE = 0.80

@@ -16,9 +16,9 @@ from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
-TURNS = np.deg2rad(np.arange(-54.0, 55.0, 18.0))
+TURNS = np.deg2rad(np.arange(-45.0, 46.0, 15.0))
 """[rad] Directions of the hand that are tried, against the direction across the row. GUESSED"""
-DEPTHS = np.array([-0.017, -0.009, 0.0, 0.009, 0.017])
+DEPTHS = np.array([-0.019, -0.010, 0.0, 0.010, 0.019])
 """[m] Distances of the cane ahead of the middle of the mouth that are tried; the mouth of 50 mm ends at 25 mm."""
 SIDES = np.linspace(-0.015, 0.015, 11)
 """[m] Distances of the cane from the middle of the mouth to the side that are tried."""
@@ -33,6 +33,10 @@ IN_VAIN_COST = 100.0
 ROOM = 0.008
 """[m] Distance from the hand within which wood may be touched: canes move, and the hand is some millimetres off.
 GUESSED"""
+TIGHT = 0.003
+"""[m] Distance from the hand within which wood will be touched, as far as the hand is off its way. GUESSED"""
+NEARNESS = 0.2
+"""[1] Cost of a point within :data:`ROOM` as a share of that of a point that is touched. GUESSED"""
 SPACING = 0.008
 """[m] Distance between the points along wood that are looked at."""
 NEIGHBOURHOOD = 0.32
@@ -171,7 +175,7 @@ def _place_on(
         outside = np.maximum(np.maximum(low - at[:, :, None], at[:, :, None] - high), 0.0)
         gap = np.sqrt((outside**2).sum(-1)).min(-1, initial=np.inf) - radius[near]
         inside = (np.abs(at) < hand.mouth + CATCH_ROOM).all(-1)
-        touched = np.clip(1.0 - gap / ROOM, 0.0, 1.0)
+        touched = NEARNESS * np.clip(1.0 - gap / ROOM, 0.0, 1.0) + np.clip(1.0 - gap / TIGHT, 0.0, 1.0)
         in_vain = any(direction @ other > np.cos(TRIED) for other in tried)
         added[rows] = touched @ touch_cost[near] + inside @ catch_cost[near] + IN_VAIN_COST * in_vain
         catches[rows] = (inside & goes[near]).any(-1)

@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from vinesim.contact.bud_forces import bud_forces
 from vinesim.core import frames
 from vinesim.interaction.detachment import Blade
 from vinesim.robot.control.cartesian_controller import CartesianController, axes_of_pose
 from vinesim.robot.control.waypoint_follower import WaypointFollower
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.drives.joint_servos import CommandError
-from vinesim.robot.tasks.mouth_place import MouthPlace, WoodAround, hand_shape, mouth_place
+from vinesim.robot.tasks.mouth_place import ENOUGH, MouthPlace, WoodAround, hand_shape, mouth_place
 from vinesim.robot.tasks.task import Task, TaskFailed
 from vinesim.scene.values import Detachment
 from vinesim.world import Physics
@@ -27,12 +28,21 @@ APPROACH = 0.18
 """[m] Length of the straight motion towards the cane, and back. GUESSED"""
 OPENING = 0.15
 """[m] Opening of the fingers, which pass beside the cane."""
-REACHED = 0.004
+REACHED = 0.003
 """[m] Distance from its place at which the mouth closes."""
-NEAR_ENOUGH = 0.012
-"""[m] Distance from its place at which a mouth that is held up closes nevertheless."""
+NEAR_ENOUGH = 0.006
+"""[m] Distance across the blades within which a mouth that is held up closes nevertheless."""
+MOUTH_MARGIN = 0.002
+"""[m] Distance from the edge of the mouth that the wood must have then."""
 TURNED = 0.25
 """[rad] Error of the hand's orientation at which the mouth may close."""
+SLOW = 0.03
+"""[m/s] Speed of the hand on the last :data:`SLOW_WAY` where there is little room beside the mouth. GUESSED: 0.3 mm in
+a step."""
+SLOW_WAY = 0.05
+"""[m] Length of the slow part of the way."""
+TOUCH = 0.5
+"""[N] Force on a bud that stays at which the hand stops."""
 IN_LINE = 0.008
 """[m] Distance from its start at which the straight motion towards the cane begins."""
 MAX_CLOSURES = 3
@@ -122,6 +132,7 @@ class PruneCanes(Task):
         self._wood = WoodAround(physics.model)
         self._kept = {cut.cane: self._from_base(cut) for stop in self.stops for cut in stop.cuts if cut.is_kept}
         """[m] For each cane that is to be shortened: the way along it that stays."""
+        self._kept_buds = self._buds_that_stay()
         self._focus = frames.compose(robot.rigid.base_state(robot.name)[0], frames.pose([1.0, 1.0, 1.0]))[:3]
 
     def focus(self) -> np.ndarray:
@@ -209,10 +220,17 @@ class PruneCanes(Task):
         yield from self._move(
             "reach", lambda: self._tip(cut) - APPROACH * self._at.ahead, speed=0.35, timeout=10.0, near=IN_LINE
         )
+        is_tight = place.cost > ENOUGH
         try:
-            yield from self._move("advance", lambda: self._tip(cut), speed=0.10, timeout=4.0, near=REACHED)
+            if is_tight:
+                yield from self._move(
+                    "advance", lambda: self._tip(cut) - SLOW_WAY * place.ahead, speed=0.10, timeout=4.0, near=0.006
+                )
+            yield from self._move(
+                "advance", lambda: self._tip(cut), speed=SLOW if is_tight else 0.10, timeout=4.0, near=REACHED
+            )
         except TaskFailed:
-            if self.arm.distance_to(self._tip(cut)) > NEAR_ENOUGH:
+            if not self._is_in_mouth(cut):
                 raise
         blades = self.robot.cutter_blades(self.arm.gripper)
         for _ in range(MAX_CLOSURES):
@@ -258,12 +276,39 @@ class PruneCanes(Task):
             off = float(np.arccos(np.clip((axes[0] @ self._at.ahead + axes[2] @ DOWN) / 2.0, -1.0, 1.0)))
             if self.arm.distance_to(there) < near and (off < TURNED or phase != "advance"):
                 return
+            if phase == "advance" and self._bud_force() > TOUCH:
+                raise TaskFailed("a bud that stays is touched")
             if self.time > end:
                 raise TaskFailed(
                     f"the hand is {self.arm.distance_to(there):.3f} m and {off:.2f} rad off: out of reach, or held"
                 )
             self.arm.move_towards(there, self._at.ahead, DOWN, speed=speed, working_height=float(there[2]))
             yield phase
+
+    def _is_in_mouth(self, cut: WoodCut) -> bool:
+        """Returns whether the wanted place is between the blades."""
+        link, offset = self._mouth_pose
+        mouth = frames.compose(self.robot.frame_pose(link), offset)
+        at = frames.rotate(frames.conjugate(mouth[3:]), self._place(cut) - mouth[:3])
+        room = np.array([-MOUTH_MARGIN, -MOUTH_MARGIN, NEAR_ENOUGH])
+        return bool((np.abs(at) < self._half + room).all())
+
+    def _buds_that_stay(self) -> np.ndarray:
+        """Returns the ids of the buds below the cuts of canes that are shortened [k]."""
+        nodes = self.physics.model.nodes
+        found = [np.zeros(0, int)]
+        for cut in (cut for stop in self.stops for cut in stop.cuts if cut.is_kept):
+            before = (nodes.body < cut.body) | ((nodes.body == cut.body) & (nodes.along < cut.along))
+            found.append(nodes.bud[(nodes.cane == cut.cane) & (nodes.bud >= 0) & before])
+        return np.concatenate(found)
+
+    def _bud_force(self) -> float:
+        """Returns the largest force [N] on a bud that stays, in the last step."""
+        physics = self.physics
+        touching = [one for one in physics.contacts if one.body >= 0]
+        if not touching or not len(self._kept_buds):
+            return 0.0
+        return float(bud_forces(physics.model, physics.state, touching)[self._kept_buds].max())
 
     def _tip(self, cut: WoodCut) -> np.ndarray:
         """Returns the place [3] m of the tool at which the cut is in the mouth."""
