@@ -144,7 +144,7 @@ def _place_on(
     """Returns the place with the least cost at ``slide`` [m] from the wanted place, and its whole cost."""
     up = np.array([0.0, 0.0, 1.0])
     turns, depths, sides = (grid.ravel() for grid in np.meshgrid(TURNS, DEPTHS, SIDES, indexing="ij"))
-    cost = 2.0 * np.abs(turns) / TURNS[-1] + np.abs(depths) / DEPTHS[-1] + 4.0 * (sides / SIDES[-1]) ** 2
+    cost = 5.0 * np.abs(turns) / TURNS[-1] + np.abs(depths) / DEPTHS[-1] + 4.0 * (sides / SIDES[-1]) ** 2
     cost += 4.0 * abs(slide) / SLIDES[-1]
     low = hand.middle - hand.half
     high = hand.middle + hand.half

@@ -35,12 +35,12 @@ NEAR_ENOUGH = 0.006
 MOUTH_MARGIN = 0.002
 """[m] Distance from the edge of the mouth that the wood must have then."""
 TURNED = 0.25
-"""[rad] Error of the hand's orientation at which the mouth may close."""
+"""[rad] Error of the hand's orientation at which it makes the last part of the way."""
 SLOW = 0.03
-"""[m/s] Speed of the hand on the last :data:`SLOW_WAY` where there is little room beside the mouth. GUESSED: 0.3 mm in
+"""[m/s] Speed of the hand on the :data:`LAST_WAY` where there is little room beside the mouth. GUESSED: 0.3 mm in
 a step."""
-SLOW_WAY = 0.05
-"""[m] Length of the slow part of the way."""
+LAST_WAY = 0.05
+"""[m] Length of the last part of the way, which begins when the hand has turned: the bars are beside the cane then."""
 TOUCH = 0.5
 """[N] Force on a bud that stays at which the hand stops."""
 IN_LINE = 0.008
@@ -220,15 +220,12 @@ class PruneCanes(Task):
         yield from self._move(
             "reach", lambda: self._tip(cut) - APPROACH * self._at.ahead, speed=0.35, timeout=10.0, near=IN_LINE
         )
-        is_tight = place.cost > ENOUGH
         try:
-            if is_tight:
-                yield from self._move(
-                    "advance", lambda: self._tip(cut) - SLOW_WAY * place.ahead, speed=0.10, timeout=4.0, near=0.006
-                )
             yield from self._move(
-                "advance", lambda: self._tip(cut), speed=SLOW if is_tight else 0.10, timeout=4.0, near=REACHED
+                "advance", lambda: self._tip(cut) - LAST_WAY * place.ahead, speed=0.10, timeout=5.0, near=IN_LINE
             )
+            speed = SLOW if place.cost > ENOUGH else 0.10
+            yield from self._move("advance", lambda: self._tip(cut), speed=speed, timeout=4.0, near=REACHED)
         except TaskFailed:
             if not self._is_in_mouth(cut):
                 raise
@@ -314,8 +311,7 @@ class PruneCanes(Task):
         """Returns the place [3] m of the tool at which the cut is in the mouth."""
         ahead = self._at.ahead
         right = frames.cross(ahead, -DOWN)
-        # with the blades down the hand's y axis points to the right, its z axis down
-        mouth = self._mouth[0] * ahead + self._mouth[1] * right + self._mouth[2] * DOWN
+        mouth = frames.rotate(self.robot.frame_pose(self.arm.tool)[3:], self._mouth)  # as the hand is turned now
         return self._place(cut) - self._at.depth * ahead - self._at.side * right - mouth
 
     def _place(self, cut: WoodCut) -> np.ndarray:
