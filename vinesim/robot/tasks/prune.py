@@ -222,7 +222,7 @@ class PruneCanes(Task):
         )
         try:
             yield from self._move(
-                "advance", lambda: self._tip(cut) - LAST_WAY * place.ahead, speed=0.10, timeout=5.0, near=IN_LINE
+                "advance", lambda: self._tip(cut) - LAST_WAY * place.ahead, speed=0.20, timeout=5.0, near=IN_LINE
             )
             speed = SLOW if place.cost > ENOUGH else 0.10
             yield from self._move("advance", lambda: self._tip(cut), speed=speed, timeout=4.0, near=REACHED)
