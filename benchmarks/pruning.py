@@ -58,7 +58,7 @@ def prune_one(seed: int, spurs: int) -> dict[str, Any]:
     model = generate(scene)
     rule = PruningRule()
     stops = plan_pruning(model, spawn_pose(scene, 0)[:2], rule, spurs=spurs or None)
-    physics = Physics(model)
+    physics = Physics(model, parameters=scene.physics)
     robot = Robot(physics.rigid, load_description(ROBOT), "pruner", pose=stops[0].base_pose)
     robot.fit_cutters(physics)
     task = PruneCanes(physics, robot, stops)

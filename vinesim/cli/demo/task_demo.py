@@ -14,6 +14,7 @@ from vinesim.cli.demo.summary import job_summary, write_summary
 from vinesim.client.programs import START_TIMEOUT, program_group
 from vinesim.client.tasks.harvesting import HarvestOptions
 from vinesim.client.tasks.planning import plan_meeting
+from vinesim.client.tasks.pruning import PruningRule, prune
 from vinesim.client.tasks.registry import UnknownTask
 from vinesim.client.tasks.seen_harvest import SURVEY_TIME
 from vinesim.client.tasks.start_poses import bunch_centres, start_pose
@@ -68,6 +69,9 @@ def run_job(
     scene = scene or ("winter_spur" if job == "prune" else "harvest")
     plan = with_seed(load_scene(scene), seed)
     description = load_description(robot)  # raise errors before any process starts
+    if job == "prune":
+        model = generate(plan)
+        prune(model.nodes, model.canes, PruningRule())
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         robot = kept_robot_file(robot, description, out)
