@@ -26,13 +26,14 @@ def cane(**numbers) -> Model:
 
 
 def breaking_moment(depth: float, segment: int, share: float) -> tuple[float, Simulation]:
-    """Bend a brittle cane by a moment at its tip that grows until it parts. Returns the moment [N m]."""
+    """Bend a brittle cane by a moment at its tip that grows until it parts, in about two seconds. Returns the moment
+    [N m]."""
     simulation = Simulation(cane(toughness=1.0), parameters=PhysicsParameters(gravity=0.0, sleep=False))
     if depth > 0.0:
         at = share * float(simulation.model.body_length[segment])
         assert simulation.physics.detachment_monitor.notch(segment, at, depth)
-    rate = 2.0
-    for _ in range(1000):
+    rate = 4.0 * remaining_strength(depth)[1]
+    for _ in range(400):
         moment = rate * simulation.time
         simulation.apply_wrench(11, (0.0, 0.0, 0.0), torque=(0.0, moment, 0.0))
         simulation.step()

@@ -35,6 +35,10 @@ GRIP_DAMPING = 20.0
 """[N s/m] Damping of a hold or a new tie, as above."""
 PULL_SPEED = 0.1
 """[m/s] Speed at which a new tie pulls a cane to its wire. GUESSED."""
+PLANT_WORK = ("tie", "untie", "take_leaves")
+"""What an actor can do at its tool."""
+TOOL_REACH = 0.1
+"""[m] Largest distance of a tool from what it works on. GUESSED: a hand's length."""
 _TIED_PLACES = 65
 """Number of places of a body among which the one nearest to a wire is found."""
 
@@ -209,6 +213,67 @@ class Handwork:
             self.plants.remove_tie(tie.body, tie.row)
             self.plants.wake(int(self.plants.model.body_tree[tie.segment]))
         tie.body = tie.row = -1
+
+    # ------------------------------------------------------------------ at a tool
+
+    def work_at(self, what: str, point: np.ndarray, actor: str) -> str:
+        """Let an actor work on the wood nearest to ``point`` [3] m: ``what`` is one of :data:`PLANT_WORK`. Call this
+        between steps. Returns what was done, as a sentence without the actor.
+
+        ``tie``: tie the cane to the nearest wire; ``untie``: open the nearest tie; ``take_leaves``: take the leaves off
+        the segment. Raises :class:`ValueError` if there is nothing of this kind within :data:`TOOL_REACH`.
+        """
+        if what not in PLANT_WORK:
+            raise ValueError(f"no work on plants {what!r}; give one of {', '.join(PLANT_WORK)}")
+        if what == "untie":
+            return self._untie_at(point, actor)
+        body, along = self._wood_at(point)
+        if what == "tie":
+            at, to = nearest_place(self.plants, body, along)
+            self.bind(body, at, to, actor)
+            return f"ties body {body} at {1e3 * at:.0f} mm to the nearest wire"
+        count = self.take_leaves(self.leaves_on(body), actor)
+        return f"takes {count} leaves off body {body}"
+
+    def _wood_at(self, point: np.ndarray) -> tuple[int, float]:
+        """Returns the piece of cane nearest to a point [3] m, and the place [m] along it."""
+        plants = self.plants
+        plants.forward_kinematics()
+        model = plants.model
+        wood = np.flatnonzero((plants.body_end > plants.body_start) & (model.body_organ != int(Organ.BUNCH)))
+        whole = np.where(plants.state.stump_of[wood] >= 0, plants.state.stump_of[wood], wood)
+        wood = wood[model.body_organ[whole] == int(Organ.CANE)]
+        pose = plants.state.body_q[wood].astype(float)
+        axis = frames.rotate(pose[:, 3:], np.array([1.0, 0.0, 0.0]))
+        along = ((point - pose[:, :3]) * axis).sum(1)
+        along = np.clip(along, plants.body_start[wood], plants.body_end[wood]).astype(float)
+        away = np.linalg.norm(pose[:, :3] + along[:, None] * axis - point, axis=1)
+        if len(wood) == 0 or away.min() > TOOL_REACH:
+            nearest = f"the nearest is {1e3 * away.min():.0f} mm away" if len(wood) else "there is none"
+            raise ValueError(f"no cane within {1e3 * TOOL_REACH:.0f} mm of the tool; {nearest}; move the tool there")
+        best = int(np.argmin(away))
+        return int(wood[best]), float(along[best])
+
+    def _untie_at(self, point: np.ndarray, actor: str) -> str:
+        """Open the tie nearest to a point [3] m, of the model or of an actor."""
+        plants = self.plants
+        plants.forward_kinematics()
+        model = plants.model
+        bound = [tie for tie in self.ties.values() if tie.body >= 0]
+        held = np.flatnonzero(~plants.state.tie_broken)
+        bodies = np.concatenate([plants.ties.tie_body[held], np.array([tie.body for tie in bound], int)]).astype(int)
+        places = np.concatenate([model.tie_point[held], np.array([[tie.at, 0.0, 0.0] for tie in bound]).reshape(-1, 3)])
+        pose = plants.state.body_q[bodies].astype(float)
+        away = np.linalg.norm(pose[:, :3] + frames.rotate(pose[:, 3:], places.astype(float)) - point, axis=1)
+        if len(bodies) == 0 or away.min() > TOOL_REACH:
+            nearest = f"the nearest is {1e3 * away.min():.0f} mm away" if len(bodies) else "there is none"
+            raise ValueError(f"no tie within {1e3 * TOOL_REACH:.0f} mm of the tool; {nearest}; move the tool there")
+        best = int(np.argmin(away))
+        if best < len(held):
+            self.untie(int(held[best]), actor)
+            return f"opens tie {held[best]}"
+        self.open(bound[best - len(held)], actor)
+        return f"opens the tie of body {bodies[best]}"
 
     # ------------------------------------------------------------------ leaves
 
