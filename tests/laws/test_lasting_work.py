@@ -55,18 +55,18 @@ def test_a_notch_weakens_a_cane_by_the_section_modulus_that_it_leaves():
 def test_a_notch_near_the_tip_of_a_segment_weakens_the_next_joint():
     simulation = Simulation(cane())
     monitor = simulation.physics.detachment_monitor
-    before = monitor.wood.law.breaks.copy()
+    before = monitor.wood.law.breaks[:12].copy()
     monitor.notch(4, 0.02, 0.5)
-    weaker = monitor.wood.law.breaks / before
+    weaker = monitor.wood.law.breaks[:12] / before
     assert weaker[5] == pytest.approx(remaining_strength(0.5)[1])
     np.testing.assert_array_equal(np.delete(weaker, 5), 1.0)
     assert not monitor.notch(4, 0.003, 0.4), "a segment has one notch, the deepest"
     monitor.notch(4, 0.003, 0.6)
-    weaker = monitor.wood.law.breaks / before
+    weaker = monitor.wood.law.breaks[:12] / before
     assert weaker[4] == pytest.approx(remaining_strength(0.6)[1])
     assert weaker[5] == 1.0
     simulation.cut(4, 0.003)  # through the notch
-    np.testing.assert_array_equal(monitor.wood.law.breaks, before)
+    np.testing.assert_array_equal(monitor.wood.law.breaks[:12], before)
 
 
 def test_a_stump_keeps_the_set_of_its_joint():
@@ -79,7 +79,7 @@ def test_a_stump_keeps_the_set_of_its_joint():
     simulation.step(400)
     state = simulation.state
     kept, flow = state.joint_set[0].copy(), float(state.joint_flow[0])
-    assert flow > 0.01
+    assert flow > 3e-3
     before = simulation.body_pose(0).astype(float)
     simulation.cut(0, 0.015)
     (stump,) = simulation.physics.plants.stumps.table[:, 0].astype(int)
@@ -143,8 +143,8 @@ def test_a_part_of_a_cut_shoot_loses_only_its_own_leaves(summer: Model):
 
 
 def test_a_tied_shoot_rests_beside_the_wire_and_its_tree_sleeps():
-    wire = Wire((0.1, 0.5, 0.06), (0.1, -0.5, 0.06))
-    shoot = CaneBuilder(length=0.3, radius=0.004, segments=8, damping_ratio=0.3)
+    wire = Wire((0.17, 0.5, 1.03), (0.17, -0.5, 1.03))
+    shoot = CaneBuilder(length=0.3, radius=0.002, segments=8, damping_ratio=0.3)
     simulation = Simulation(assemble([shoot], wires=[wire]))
     tie = simulation.tie(4)
     simulation.step(600)
@@ -159,3 +159,26 @@ def test_a_tied_shoot_rests_beside_the_wire_and_its_tree_sleeps():
         simulation.take_leaves(3, 0.2, 0.1)
     with pytest.raises(UsageError, match=r"body 3 has wood from 0 to 0\.\d+ m, not at 1 m"):
         simulation.tie(3, 1.0, (0.0, 0.0, 1.0))
+
+
+def test_an_actor_works_on_the_wood_at_its_tool(summer: Model):
+    physics = Simulation(summer).physics
+    handwork = physics.handwork
+    tie = int(np.argmax(np.isin(summer.tie_body, summer.leaf_body)))
+    body = int(summer.tie_body[tie])
+    pose = physics.state.body_q[body].astype(float)
+    at = pose[:3] + frames.rotate(pose[3:], summer.tie_point[tie].astype(float))
+    assert handwork.work_at("untie", at, "ada").startswith("opens tie ")
+    assert physics.state.tie_broken.sum() == 1
+    assert "to the nearest wire" in handwork.work_at("tie", at, "ada")
+    (bound,) = handwork.ties.values()
+    assert handwork.touched == ((int(summer.body_tree[bound.segment]), "ada"),)
+    said = handwork.work_at("take_leaves", at, "ada")
+    assert said.startswith(f"takes {physics.state.leaf_off.sum()} leaves off body ")
+    for what, reason in (
+        ("shake", "no work on plants 'shake'; give one of tie, untie, take_leaves"),
+        ("tie", r"no cane within 100 mm of the tool; the nearest is \d+ mm away; move the tool there"),
+        ("untie", "no tie within 100 mm of the tool"),
+    ):
+        with pytest.raises(ValueError, match=reason):
+            handwork.work_at(what, np.array([0.0, 0.0, 50.0]), "ada")

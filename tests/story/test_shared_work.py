@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from tests.support.long_rows import long
 from tests.support.shared_vineyard import DT, World
 from vinesim.client.client import Client
 from vinesim.client.recording.recorder import Recorder
@@ -97,7 +98,7 @@ def work(world: World, ada: Worker, bob: Worker) -> None:
     pose = ada.physics.snapshot().body_q
     for worker, bodies in ((ada, d), (bob, e)):
         body = int(bodies[2])
-        worker.physics.tie(body, 0.01, pose[body, :3].astype(float) + [0.0, 0.02, 0.0], worker.client.name)
+        worker.physics.tie(body, 0.01, pose[body, :3] + np.array([0.0, 0.02, 0.0]), worker.client.name)
     for worker, bunch in ((ada, 0), (bob, 3)):
         if bunch < len(model.bunch_body):
             worker.physics.pick(bunch)
@@ -143,7 +144,7 @@ def differing(one: Client, other: Client) -> list[str]:
     return [name for name in here if here[name] != there[name]]
 
 
-@pytest.mark.parametrize("scene", ["vsp", "winter_spur"])
+@pytest.mark.parametrize("scene", ["winter_spur", *long("vsp")])
 def test_two_clients_and_a_late_one_agree_by_hash_and_a_replay_to_the_bit(scene: str, tmp_path: pathlib.Path):
     world = World(small(scene))
     world.server.bus.declare_queryable("clock/*", lambda asked: encode_time(decode_time(asked)[0], 1000.0 + world.now))

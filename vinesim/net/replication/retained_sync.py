@@ -119,7 +119,7 @@ class RetainedSync:
                 batch = []
                 free_bytes = MAX_DATAGRAM
                 for object_id in sorted(waiting):
-                    free_bytes -= TYPICAL_RECORD_SIZE + len(waiting[object_id].trees)
+                    free_bytes -= TYPICAL_RECORD_SIZE + len(waiting[object_id].trees) + len(waiting[object_id].wood)
                     if free_bytes < 0 and batch:
                         break
                     batch.append(object_id)
