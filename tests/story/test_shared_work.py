@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import pathlib
+import time
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
 import pytest
 
+from tests.support.live_server import ServerProcess
 from tests.support.long_rows import long
 from tests.support.shared_vineyard import DT, World
 from vinesim.client.client import Client
@@ -20,6 +24,7 @@ from vinesim.core import frames
 from vinesim.net.codec.control import decode_time, encode_time
 from vinesim.net.recording.mcap_reader import read_recording
 from vinesim.net.recording.mcap_writer import RecordingWriter
+from vinesim.net.transport.zenoh_bus import ZenohBus
 from vinesim.scene import spec as scenes
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
@@ -186,6 +191,46 @@ def test_two_clients_and_a_late_one_agree_by_hash_and_a_replay_to_the_bit(scene:
     digests = {replayed(world, file) for _ in range(2)}
     assert len(digests) == 1
     assert {lasting for _, lasting in digests} == {lasting_digest(ada.physics)}
+
+
+class ZenohWorld(World):
+    """The same clients over real Zenoh, with a server in a process of its own, in real time."""
+
+    def __init__(self, model: Model, endpoint: str) -> None:
+        self.model = model
+        self.scene = scenes.load_scene("demo")
+        self.clients = {}
+        self.hub = SimpleNamespace(
+            bus=lambda name: self.opened.enter_context(ZenohBus(name, connect=endpoint)), advance=lambda _: None
+        )
+        self.server = SimpleNamespace(tick=lambda: None)
+        self.opened = contextlib.ExitStack()
+
+    @property
+    def now(self) -> float:
+        return time.monotonic()
+
+    @now.setter
+    def now(self, _: float) -> None:
+        """Real time passes alone."""
+
+
+@pytest.mark.long
+def test_clients_over_zenoh_agree_by_hash():
+    with ServerProcess("tcp/127.0.0.1:0") as server:
+        world = ZenohWorld(small("winter_spur"), server.endpoint)
+        with world.opened:
+            ada, bob = (Worker(world.join(name, x, -2.0)) for name, x in (("ada", 0.5), ("bob", 1.5)))
+            world.until(lambda: "ada" in bob.client.remote_actors and "bob" in ada.client.remote_actors, 60.0)
+            work(world, ada, bob)
+            carl = world.join("carl", 1.0, 2.0)
+            world.until(lambda: "ada" in carl.remote_actors, 60.0)
+            world.until(lambda: len(bob.physics.handwork.ties) == 2, 60.0)
+            more_work(world, ada, bob)
+            world.until(lambda: is_quiet(world), 120.0)
+            world.until(lambda: not any(differing(ada.client, other) for other in (bob.client, carl)), 60.0)
+            assert (ada.physics.state.notch_depth > 0.2).sum() >= 2
+            assert len(ada.physics.plants.stumps.table) >= 2
 
 
 def replayed(world: World, file: pathlib.Path) -> tuple[str, str]:
