@@ -44,7 +44,7 @@ JITTER = 0.005
 """[s] From client to client, one way, and its spread."""
 LOSS = 0.01
 """[1] Share of messages that may be lost."""
-QUIET = 60.0
+QUIET = 20.0
 """[s] Longest time after the work until everything is at rest."""
 LONGEST_BEND = 60
 """Number of steps for which an actor pushes a cane at most."""
