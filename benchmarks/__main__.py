@@ -50,6 +50,16 @@ def _require(*options: tuple[str, int, int]) -> None:
             raise UsageError(f"--{option} is {value}: give {least} or more")
 
 
+def _shared_harvest(scene: str, minutes: float, period: float, seed: int, replays: int) -> Iterator[Measurement]:
+    for option, value, least in (("seed", seed, 0), ("replays", replays, 0)):
+        if value < least:
+            raise UsageError(f"--{option} is {value}: give {least} or more")
+    for option, value in (("minutes", minutes), ("period", period)):
+        if not 0.0 < value < 1e4:
+            raise UsageError(f"--{option} is {value:g}: give more than 0, below 10000")
+    return _call("shared_harvest:shared_harvest")(scene, minutes, period, seed, replays, _announce)
+
+
 def _kill(times: int, seed: int) -> Iterator[Measurement]:
     if times < 1:
         raise UsageError(f"--times is {times}: give 1 or more")
@@ -122,6 +132,17 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
             "spurs": {"type": int, "default": 0, "help": "largest number of spurs of each vine; 0: all"},
             "record": {"type": pathlib.Path, "help": "file of results by seed; seeds that it has are not run again"},
             "jobs": {"type": int, "default": 1, "help": "number of processes, each with a seed at a time"},
+        },
+    ),
+    "shared_harvest": (
+        _shared_harvest,
+        "two clients prune, pick, tie and bend one vine, a third joins late: are all equal by hash, and a replay?",
+        {
+            "scene": {"default": "vsp", "help": "scene whose first vine is worked on"},
+            "minutes": {"type": float, "default": 10.0, "help": "simulated time of the work"},
+            "period": {"type": float, "default": 4.0, "help": "time between two pieces of work [s]"},
+            "seed": {"type": int, "default": 1, "help": "seed of the work and of the network"},
+            "replays": {"type": int, "default": 2, "help": "number of replays of the recording"},
         },
     ),
     "sensors": (
