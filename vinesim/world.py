@@ -120,7 +120,7 @@ class Physics:
             ("wind: set the air velocity at trees near actors", self._set_wind),
             ("grasps: close and open hands, pull held plants", self.grasp_manager.begin_step),
             ("blades: hold the wood between closing edges", self._hold_wood),
-            ("rigid: predict velocities without plant contacts", self.rigid.predict),
+            ("rigid: predict velocities without plant contacts", self._predict_rigid),
             ("contacts: wake trees near moving geoms", self.contact_solver.wake_near_trees),
             ("detail: refine bunches near actors", self._refine_bunches),
             ("elastic supports: balance wires and arms with awake trees, wake others", self._update_elastic_supports),
@@ -163,6 +163,11 @@ class Physics:
         if self.wind is not None and (actors := self.rigid.actors):
             observers = np.array([self.rigid.actor_position(name) for name in actors]), self.parameters.wind_radius
         self.wind_on_plants.update(self.wind, self.time + self.wind_time_offset, observers)
+
+    def _predict_rigid(self) -> None:
+        if self.elastic_supports.count:  # the wires that robots press on follow from the poses of the shoots now
+            self.update_kinematics()
+        self.rigid.predict()
 
     def _refine_bunches(self) -> None:
         coarsened = self.level_of_detail.update(self.contact_solver.near_trees)

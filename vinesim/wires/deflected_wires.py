@@ -109,6 +109,22 @@ class DeflectedWires:
         """Pieces [k] whose offset is not 0; a view that the next step overwrites."""
         return self._geoms.deflected[: self._geoms.count[0]]
 
+    @property
+    def energy(self) -> float:
+        """[J] Elastic energy of wires and ties due to the contacts that press on the wires, beyond the energy that
+        :func:`vinesim.api.energy.energy` counts for the ties: half the sum of force times displacement."""
+        presses = self.presses
+        count = int(presses.count[0])
+        force = -presses.pushed[:count, None] * presses.normal[:count]
+        total = 0.0
+        for j in np.flatnonzero(presses.pushed[:count] > 0.0):
+            on_it = presses.piece[:count] == presses.piece[j]
+            moved = self._supports.deflection_at(
+                int(presses.piece[j]), float(presses.along[j]), presses.along[:count][on_it], force[on_it]
+            )
+            total += 0.5 * float(force[j] @ moved)
+        return total
+
     def bind(self, contacts: SharedArrays) -> tuple[KernelGraph, KernelGraph]:
         """Returns two kernel graphs: the first finds the springs of ``contacts``, the second stores the contacts that
         press on a wire."""

@@ -96,10 +96,10 @@ class ElasticSupports:
                 "wake_distance": WAKE_SHARE * parameters.sleep_distance / nodes["response"],
             }
             | {name: nodes[name] for name in ("axis", "body", "point", "origin")},
-            self._wires(wires),
+            self._wire_arrays(wires),
         )
 
-    def _wires(self, nodes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    def _wire_arrays(self, nodes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Returns the arrays of the pieces of wire for :func:`kernels.wire_spring`. ``nodes``: nodes of the wires."""
         model = self._plants.model
         tension = model.fixed_tension.astype(float)
@@ -168,7 +168,8 @@ class ElasticSupports:
             ],
         )
         self._solve = KernelGraph(solve)
-        self.wire_structs = SharedArrays(kernels.Wires, **wires).struct, node_struct, body_struct, spring_struct
+        self._wires = SharedArrays(kernels.Wires, **wires)
+        self.wire_structs = self._wires.struct, node_struct, body_struct, spring_struct
         """Arguments of :func:`kernels.wire_spring`, except the loads."""
 
     def _slide(self, tie: int, way: np.ndarray) -> None:
@@ -195,6 +196,22 @@ class ElasticSupports:
         self._was_active[:] = False
         self._was_active[self.active] = True
         return pieces[pieces >= 0]
+
+    def deflection_at(self, piece: int, x: float, at: np.ndarray, force: np.ndarray) -> np.ndarray:
+        """Returns the displacement [3] m of the point ``x`` [m] from the start of a piece of wire, which deflects by
+        its ties and by ``force`` [k, 3] N at the points ``at`` [k] m."""
+        wires, nodes = self._wires, self._nodes
+        support = int(wires.support[piece])
+        mine = slice(0, 0) if support < 0 else slice(*nodes.first[support : support + 2].tolist())
+        places = np.concatenate([[0.0], wires.node_along[mine], wires.length[[piece]]])
+        moved = np.concatenate([np.zeros((1, 3)), self.deflection[mine], np.zeros((1, 3))])
+        right = int(np.clip(np.searchsorted(places, x), 1, len(places) - 1))
+        low, high = places[right - 1 : right + 1]
+        share = (x - low) / max(high - low, 1e-9)
+        between = (at >= low) & (at <= high)
+        lever = np.maximum(np.minimum(at, x) - low, 0.0) * np.maximum(high - np.maximum(at, x), 0.0)
+        lever = np.where(between, lever, 0.0) / max(float(wires.tension[piece]) * (high - low), 1e-9)
+        return (1.0 - share) * moved[right - 1] + share * moved[right] + lever @ force
 
     def place(self, trees: np.ndarray) -> None:
         """Mark sleeping trees [k] as moved to another pose, so that the next :meth:`update` computes the wires and arms

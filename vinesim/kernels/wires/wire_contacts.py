@@ -81,6 +81,7 @@ class WirePresses:
     normal: wp.array(dtype=wp.vec3d)
     place: wp.array(dtype=wp.vec3d)  # [m] displacement of the wire from its undeflected position
     force: wp.array(dtype=wp.float64)  # [N] force expected in the next step
+    pushed: wp.array(dtype=wp.float64)  # [N] force of the last step
     weight: wp.array(dtype=wp.float64)
     others: wp.array(dtype=wp.float64)
 
@@ -286,6 +287,7 @@ def add_presses(
             found_out.normal[k] = contacts.normal[i]
             found_out.place[k] = place
             found_out.force[k] = expected
+            found_out.pushed[k] = force
             found_out.weight[k] = weight
             found_out.others[k] = contacts.others[i]
 
@@ -300,6 +302,7 @@ def copy_press(j: int, k: int, presses: WirePresses, presses_out: WirePresses):
     presses_out.normal[k] = presses.normal[j]
     presses_out.place[k] = presses.place[j]
     presses_out.force[k] = presses.force[j]
+    presses_out.pushed[k] = presses.pushed[j]
     presses_out.weight[k] = presses.weight[j]
     presses_out.others[k] = presses.others[j]
 
