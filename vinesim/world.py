@@ -14,6 +14,7 @@ import numpy as np
 from vinesim.contact.contact_solver import ContactSolver
 from vinesim.core import frames
 from vinesim.interaction.blades import Blade
+from vinesim.interaction.breaking import WireBreak
 from vinesim.interaction.detachment import DetachmentMonitor
 from vinesim.interaction.dormant_bunches import DormantBunches
 from vinesim.interaction.fruit_damage import FruitMonitor
@@ -201,6 +202,8 @@ class Physics:
     def _deflect_wires(self) -> None:
         self.contact_solver.report_wires()
         self.wires.end_step(self.rigid.mj_data.tree_asleep)
+        if self._detachment:
+            self.detachment_monitor.break_wires(self.elastic_supports)
 
     def _detach(self) -> None:
         self.detachments = self.detachment_monitor.update(check_load=self._detachment)
@@ -234,6 +237,11 @@ class Physics:
     def closings(self) -> tuple[BladeClosing, ...]:
         """Closings of blades that ended in the last step."""
         return self.detachment_monitor.closings
+
+    @property
+    def wire_breaks(self) -> tuple[WireBreak, ...]:
+        """Pieces of wire that broke in the last step, sorted."""
+        return self.detachment_monitor.wire_breaks
 
     @property
     def contacts(self) -> tuple[Contact, ...]:

@@ -111,12 +111,13 @@ class DeflectedWires:
 
     @property
     def energy(self) -> float:
-        """[J] Elastic energy of wires and ties due to the contacts that press on the wires, beyond the energy that
-        :func:`vinesim.api.energy.energy` counts for the ties: half the sum of force times displacement."""
+        """[J] Elastic energy of wires and ties beyond the energy that :func:`vinesim.api.energy.energy` counts for the
+        ties, which is that of wires of their present, constant tension: half the sum of force times displacement for
+        the contacts that press on the wires, less what wires save whose tension has grown with their length."""
         presses = self.presses
         count = int(presses.count[0])
         force = -presses.pushed[:count, None] * presses.normal[:count]
-        total = 0.0
+        total = -self._supports.tightening
         for j in np.flatnonzero(presses.pushed[:count] > 0.0):
             on_it = presses.piece[:count] == presses.piece[j]
             moved = self._supports.deflection_at(
@@ -171,7 +172,14 @@ class DeflectedWires:
         deflect = KernelLaunch(
             kernels.deflect_wires,
             [self._numbers, *self._supports.wire_structs[:2], self._tree_awake, share(self._rigid_asleep, wp.int32)],
-            [self._found.struct, self.presses.struct, self._load, self._is_loaded, self._geoms.struct],
+            [
+                self._found.struct,
+                self.presses.struct,
+                self._load,
+                self._is_loaded,
+                self._geoms.struct,
+                *self._supports.tension_arrays,
+            ],
             threads=1,
         )
         self._deflect = KernelGraph(deflect)

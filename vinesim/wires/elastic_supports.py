@@ -82,6 +82,7 @@ class ElasticSupports:
         self.load = np.zeros((len(self._tree), 3))
         """[node, 3] N: forces of contacts on the nodes of wires. The forces of ties are not included."""
         self._wire_ties = wires["tie"]
+        self._strength = np.where(model.fixed_strength > 0.0, model.fixed_strength, np.inf)
         self._tie_changes = 0
         first_tie = np.searchsorted(model.tie_body, model.tie_body[wires["tie"]])
         stiffness, last_stiffness = _springs_in_series(nodes["compliance"], nodes["whole"], nodes["is_arm"], first)
@@ -92,6 +93,7 @@ class ElasticSupports:
                 "stiffness": stiffness,
                 "last_stiffness": last_stiffness,
                 "tree": self._tree,
+                "piece": self._piece.astype(np.int32),
                 "number": np.append(wires["tie"] - first_tie, 0 * arms["body"]).astype(np.int32),
                 "wake_distance": WAKE_SHARE * parameters.sleep_distance / nodes["response"],
             }
@@ -109,7 +111,11 @@ class ElasticSupports:
         along = np.zeros(len(self._tree))
         along[: len(nodes["support"])] = nodes["compliance"] * tension[nodes["support"]]
         return {
-            "tension": tension,
+            "tension": tension.copy(),
+            "straight_tension": np.maximum(tension, 1e-9),
+            "stretch": model.fixed_stretch.astype(float),
+            "bulge": np.zeros(len(tension)),
+            "resistance": np.zeros(len(tension)),
             "length": np.linalg.norm(way, axis=1),
             "support": support,
             "node_along": along,
@@ -128,6 +134,7 @@ class ElasticSupports:
             "ratio": np.zeros(count),
             "velocity": np.zeros((count, 3)),
             "share": np.zeros(count),
+            "fall": np.zeros((count, 3)),
         }
         bodies = {
             "body_q": state.body_q,
@@ -150,9 +157,11 @@ class ElasticSupports:
         node_struct = self._nodes.struct
         body_struct = SharedArrays(kernels.SupportedBodies, **bodies).struct
         spring_struct = SharedArrays(kernels.SupportedSprings, **springs).struct
+        self._wires = SharedArrays(kernels.Wires, **wires)
         solve = KernelLaunch(
             kernels.balance_supports,
             [
+                self._wires.struct,
                 node_struct,
                 share(self._active_count, wp.int32),
                 share(self._active, wp.int32),
@@ -163,12 +172,17 @@ class ElasticSupports:
             [
                 SharedArrays(kernels.SupportState, **shape).struct,
                 spring_struct,
+                share(self._wires.tension, wp.float64),
+                share(self._wires.resistance, wp.float64),
                 share(self._is_moved, wp.bool),
                 share(self._moved_count, wp.int32),
             ],
         )
         self._solve = KernelGraph(solve)
-        self._wires = SharedArrays(kernels.Wires, **wires)
+        self.tension_arrays = [
+            share(getattr(self._wires, name), wp.float64) for name in ("bulge", "tension", "resistance")
+        ]
+        """Arrays of ``kernels.Wires`` that change."""
         self.wire_structs = self._wires.struct, node_struct, body_struct, spring_struct
         """Arguments of :func:`kernels.wire_spring`, except the loads."""
 
@@ -176,6 +190,29 @@ class ElasticSupports:
         """Let a tie that slips along its wire hold it further on. The node's place in the wire's equations stays."""
         if tie in self._node_of:
             self._origin[self._node_of[tie]] += way
+
+    @property
+    def tension(self) -> np.ndarray:
+        """[piece] N, tension of each piece of wire now; 0 for a broken wire, and for pieces that are not taut wires."""
+        return self._wires.tension
+
+    def overloaded(self) -> np.ndarray:
+        """Returns the pieces of wire [k] whose tension has passed their strength."""
+        return np.flatnonzero(self._wires.tension > self._strength)
+
+    def break_wire(self, piece: int) -> np.ndarray:
+        """Let a piece of wire bear nothing any more. Returns the ties [k] that it held."""
+        self._wires.tension[piece] = self._wires.bulge[piece] = self._wires.resistance[piece] = 0.0
+        ties = self._wire_ties[self._plants.model.tie_wire[self._wire_ties] == piece]
+        return ties[~self._plants.state.tie_broken[ties]]
+
+    @property
+    def tightening(self) -> float:
+        """[J] Tension times lengthening of all wires, minus the work that lengthened them: their tension has grown
+        with their length."""
+        wires = self._wires
+        rise = np.where(wires.stretch > 0.0, np.maximum(wires.tension - wires.straight_tension, 0.0), 0.0)
+        return 0.5 * float((rise * rise / np.maximum(wires.stretch, 1e-9)).sum())
 
     def set_loaded(self, supports: np.ndarray) -> None:
         """Set the supports (wires or arms) [k] on which :attr:`load` acts until the next call."""
