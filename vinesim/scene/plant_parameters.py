@@ -182,7 +182,7 @@ class Trellis(_Part, frozen=True, kw_only=True):
     """Force along its wire at which a tie slips."""
     tie_strength: Annotated[Number, "N"] = Number(60.0, "N", "GUESSED", "as in vine.toml")
     """Force at which a tie breaks, or lets go of its wire."""
-    wire_modulus: Annotated[Number, "Pa"] = Number(2e11, "Pa", "SOURCED", "as in vine.toml")
+    wire_modulus: Annotated[Number, "Pa"] = Number(2e11, "Pa", "GUESSED", "as in vine.toml")
     """Young's modulus of a wire."""
     wire_strength: Annotated[Number, "Pa"] = Number(6e8, "Pa", "GUESSED", "as in vine.toml")
     """Stress at which a wire breaks."""
