@@ -369,7 +369,6 @@ def break_at_random(scene: str, count: int, seed: int, at_once: int = 24) -> Non
         physics.step()
     assert breaks >= count
     assert np.isfinite(physics.snapshot().body_q).all()
-    print(scene, breaks, step, physics.faults)
     assert {name: n for name, n in physics.faults.items() if n and name != "trees_slowed"} == {}
 
 
