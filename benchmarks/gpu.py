@@ -25,7 +25,6 @@ import warp as wp
 
 from vinesim.bench import scenes
 from vinesim.bench.plants import plain_cane
-from vinesim.worlds.batch_contacts import BatchContacts
 from vinesim.core import frames
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import assemble
@@ -33,6 +32,7 @@ from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
 from vinesim.world import Physics
+from vinesim.worlds.batch_contacts import BatchContacts
 
 TICKS = 100
 PER_TREE = 17

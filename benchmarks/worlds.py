@@ -73,7 +73,9 @@ def arm() -> RobotSpec:
 
     def link(name: str, mass: float, shape: str = "", at: str = "0 0 0", rpy: str = "0 0 0") -> str:
         i = 0.004 * mass
-        collision = f'<collision><origin xyz="{at}" rpy="{rpy}"/><geometry>{shape}</geometry></collision>' if shape else ""
+        collision = (
+            f'<collision><origin xyz="{at}" rpy="{rpy}"/><geometry>{shape}</geometry></collision>' if shape else ""
+        )
         return (
             f'<link name="{name}"><inertial><origin xyz="{at}"/><mass value="{mass}"/>'
             f'<inertia ixx="{i}" iyy="{i}" izz="{i}" ixy="0" ixz="0" iyz="0"/></inertial>{collision}</link>'
@@ -142,7 +144,9 @@ def ours(count: int, device: str, steps: int, canes: int, *, touched: bool) -> d
         row["free_gb"] = round(free / 1e9, 2)
         for name, part in (("rigid_ms", worlds.bodies.predict), ("rigid_2_ms", worlds.bodies.integrate)):
             row[name] = round(1e3 * seconds_a_step(lambda n, part=part: [part() for _ in range(n)], 50, device), 3)
-        row["contacts_ms"] = round(1e3 * seconds_a_step(lambda n: [worlds.contacts.solve() for _ in range(n)], 50, device), 3)
+        row["contacts_ms"] = round(
+            1e3 * seconds_a_step(lambda n: [worlds.contacts.solve() for _ in range(n)], 50, device), 3
+        )
     return row
 
 
@@ -205,7 +209,11 @@ def peer_scene(*, touched: bool) -> str:
             '<geom type="capsule" fromto="0 0 -.04 0 0 -.14" size=".04" mass=".4"/></body>'
         )
         body += "</body>" * 16
-    bar = f'<geom type="capsule" fromto="{BAR[0]} -1 {BAR[1]} {BAR[0]} 1 {BAR[1]}" size="{BAR_RADIUS}"/>' if touched else ""
+    bar = (
+        f'<geom type="capsule" fromto="{BAR[0]} -1 {BAR[1]} {BAR[0]} 1 {BAR[1]}" size="{BAR_RADIUS}"/>'
+        if touched
+        else ""
+    )
     servos = "".join(f'<position joint="j{i}" kp="300" kv="30"/>' for i in range(len(AXES)))
     servos += "".join(f'<position joint="{side}" kp="500" kv="20"/>' for side in "lr")
     return (

@@ -14,6 +14,7 @@ import numpy as np
 from vinesim.contact.contact_solver import ContactSolver
 from vinesim.core import frames
 from vinesim.interaction.blades import Blade
+from vinesim.interaction.breaking import WireBreak
 from vinesim.interaction.detachment import DetachmentMonitor
 from vinesim.interaction.dormant_bunches import DormantBunches
 from vinesim.interaction.fruit_damage import FruitMonitor
@@ -124,7 +125,7 @@ class Physics:
             ("grasps: close and open hands, pull held plants", self.grasp_manager.begin_step),
             ("blades: hold the wood between closing edges", self._hold_wood),
             ("handwork: pull canes to the wires to which actors tie them", self.handwork.update),
-            ("rigid: predict velocities without plant contacts", self.rigid.predict),
+            ("rigid: predict velocities without plant contacts", self._predict_rigid),
             ("contacts: wake trees near moving geoms", self.contact_solver.wake_near_trees),
             ("detail: refine bunches near actors", self._refine_bunches),
             ("elastic supports: balance wires and arms with awake trees, wake others", self._update_elastic_supports),
@@ -168,6 +169,11 @@ class Physics:
             observers = np.array([self.rigid.actor_position(name) for name in actors]), self.parameters.wind_radius
         self.wind_on_plants.update(self.wind, self.time + self.wind_time_offset, observers)
 
+    def _predict_rigid(self) -> None:
+        if self.elastic_supports.count:  # the wires that robots press on follow from the poses of the shoots now
+            self.update_kinematics()
+        self.rigid.predict()
+
     def _refine_bunches(self) -> None:
         coarsened = self.level_of_detail.update(self.contact_solver.near_trees)
         if len(coarsened):  # the bounding boxes of sleeping trees must follow their new shapes
@@ -200,6 +206,8 @@ class Physics:
     def _deflect_wires(self) -> None:
         self.contact_solver.report_wires()
         self.wires.end_step(self.rigid.mj_data.tree_asleep)
+        if self._detachment:
+            self.detachment_monitor.break_wires(self.elastic_supports)
 
     def _detach(self) -> None:
         self.detachments = self.detachment_monitor.update(check_load=self._detachment)
@@ -233,6 +241,11 @@ class Physics:
     def closings(self) -> tuple[BladeClosing, ...]:
         """Closings of blades that ended in the last step."""
         return self.detachment_monitor.closings
+
+    @property
+    def wire_breaks(self) -> tuple[WireBreak, ...]:
+        """Pieces of wire that broke in the last step, sorted."""
+        return self.detachment_monitor.wire_breaks
 
     @property
     def contacts(self) -> tuple[Contact, ...]:

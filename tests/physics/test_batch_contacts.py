@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from tests.support.long_rows import each_once
-from vinesim.worlds.batch_contacts import BatchContacts
 from vinesim.core import frames
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.plants.device_buffers import DeviceBuffers
@@ -18,6 +17,7 @@ from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
 from vinesim.world import Physics
+from vinesim.worlds.batch_contacts import BatchContacts
 
 PARAMETERS = PhysicsParameters(sleep=False)
 BARS = np.array([(0.3, -1.0, 1.975), (0.6, -1.0, 1.9)], np.float32)

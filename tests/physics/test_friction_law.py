@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from tests.physics.test_delassus import assembled
 from tests.physics.test_batch_contacts import canes, moving
+from tests.physics.test_delassus import assembled
 from vinesim.core.warp_arrays import SharedArrays, share, zeros
 from vinesim.kernels.contact import tree_islands
 from vinesim.kernels.contact.friction_law import (

@@ -43,7 +43,9 @@ def test_a_hand_grasps_and_lifts_a_bunch_as_in_a_client():
         worlds.bodies.targets.assign(np.array([targets(tick, 0.1), targets(tick, 0.05)], np.float32))
         physics.step()
         worlds.step()
-        most = max(most, max(np.linalg.norm(contact.force) for contact in physics.contacts) if physics.contacts else 0.0)
+        most = max(
+            most, max(np.linalg.norm(contact.force) for contact in physics.contacts) if physics.contacts else 0.0
+        )
     worlds.download()
     physics.update_kinematics()
     bodies = len(physics.state.body_q)

@@ -16,7 +16,15 @@ from vinesim.contact.contact_solver import ContactSolver
 from vinesim.core import frames
 from vinesim.core.errors import checked_index
 from vinesim.interaction.blades import Blade, BladeGrips, WoodPiece
-from vinesim.interaction.breaking import CRACK, NOTCH, Overload, WoodMonitor, distance_from_base
+from vinesim.interaction.breaking import (
+    CRACK,
+    NOTCH,
+    UNTIE,
+    Overload,
+    WireBreak,
+    WoodMonitor,
+    distance_from_base,
+)
 from vinesim.interaction.cutting_force import KERF, remaining_strength, shear_force
 from vinesim.interaction.stalk import cut_place, leave_stump, model_pieces, stalk_below, with_settled_stalk, with_stalk
 from vinesim.plants.articulation_solver import ArticulationSolver
@@ -26,6 +34,7 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.spare_bodies import PLACE_STEP
 from vinesim.scene.values import BladeClosing, Breakage, Contact, Detachment
+from vinesim.wires.elastic_supports import ElasticSupports
 
 log = logging.getLogger(__name__)
 
@@ -67,6 +76,8 @@ class DetachmentMonitor:
         """Finds the wood that breaks under its load."""
         self.breakages: tuple[Breakage, ...] = ()
         """What has given without parting in the last step."""
+        self.wire_breaks: tuple[WireBreak, ...] = ()
+        """Wires that broke in the last step, sorted by piece."""
         self._breakages: list[Breakage] = []
         self._detachments: list[Detachment] = []
 
@@ -105,6 +116,22 @@ class DetachmentMonitor:
             model = self.plants.model
             body = int(model.tie_body[tie])
             self._record_breakage(kind, "pull", body, np.append(pull, np.zeros(3)), 0.0, tie)
+
+    def break_wires(self, supports: ElasticSupports) -> None:
+        """Let wires break whose tension has passed their strength, and free the ties on them. Call it before
+        :meth:`update`, after the wires have got the tension of the step."""
+        if self.wire_breaks:
+            self.wire_breaks = ()
+        for piece in supports.overloaded().tolist():
+            plants = self.plants
+            tension = float(supports.tension[piece])
+            ties = supports.break_wire(piece)
+            self.wire_breaks += (WireBreak(plants.tick, piece, tension, tuple(ties.tolist())),)
+            for tie in ties.tolist():
+                plants.break_tie(tie)
+                body = int(plants.ties.tie_body[tie])
+                plants.wake(int(plants.model.body_tree[body]))
+                self._record_breakage(UNTIE, "pull", body, np.zeros(6), 0.0, tie)
 
     def _part_cane(self, broken: Overload) -> None:
         """Let a broken cane part at its joint, or at the cut in part that has weakened it, or report a crack."""

@@ -176,9 +176,7 @@ class ReachEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._begin(np.ones(self.num_envs, np.bool_))
         return self._observed(), {"success": np.zeros(self.num_envs, np.bool_)}
 
-    def step(
-        self, actions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Take one action in each world; see the class."""
         self._action.assign(np.asarray(actions, np.float32).reshape(self.num_envs, len(AXES)))
         self._move()

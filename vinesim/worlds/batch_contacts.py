@@ -19,11 +19,11 @@ from vinesim.core.warp_arrays import SharedArrays, struct_fields
 from vinesim.kernels.contact import broadphase, structs
 from vinesim.kernels.contact.distance import CAPSULE, PLANE, SPHERE
 from vinesim.kernels.contact.friction_law import Surface
-from vinesim.kernels.worlds.dense_solver import WorldSearch, WorldSystem
-from vinesim.kernels.worlds.views import GROUP
 from vinesim.kernels.graph import THREADS_PER_BLOCK, KernelGraph, KernelLaunch
 from vinesim.kernels.plants import structs as plant_structs
 from vinesim.kernels.worlds import contact_step, delassus, narrowphase, reset, rigid_state
+from vinesim.kernels.worlds.dense_solver import WorldSearch, WorldSystem
+from vinesim.kernels.worlds.views import GROUP
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.plants.device_buffers import WARP_SIZE
 from vinesim.rigid.collision_geoms import PLANE_HALF_SIZE
@@ -266,7 +266,9 @@ class BatchContacts:
             WorldSearch, dict.fromkeys(struct_fields(WorldSearch), searched), {"factor": rows + 1}
         )
         busy_rows = self._groups * rows
-        self._dense = self._allocated(WorldSystem, dict.fromkeys(struct_fields(WorldSystem), busy_rows), {"matrix": rows})
+        self._dense = self._allocated(
+            WorldSystem, dict.fromkeys(struct_fields(WorldSystem), busy_rows), {"matrix": rows}
+        )
         self._dense_search = self._allocated(
             WorldSearch, dict.fromkeys(struct_fields(WorldSearch), busy_rows), {"factor": rows + 1}
         )

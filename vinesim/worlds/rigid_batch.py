@@ -75,9 +75,7 @@ class RigidBatch:
         self.integrate = KernelGraph(ForeignLaunches(lambda: step2(self.model, self.data)), device=device)
         """Launches the second half of a step, with the generalised forces in :attr:`applied`."""
         kinematics = self._mjw.kinematics
-        self.update_kinematics = KernelGraph(
-            ForeignLaunches(lambda: kinematics(self.model, self.data)), device=device
-        )
+        self.update_kinematics = KernelGraph(ForeignLaunches(lambda: kinematics(self.model, self.data)), device=device)
         """Computes the poses of all bodies after a step or a reset; a step leaves those of its start."""
 
     def _drives(self) -> KernelLaunch:

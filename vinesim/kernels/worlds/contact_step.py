@@ -15,7 +15,6 @@ from vinesim.kernels.contact.body_motion import to_double, to_single
 from vinesim.kernels.contact.forces import store_contact
 from vinesim.kernels.contact.friction_law import Surface
 from vinesim.kernels.contact.jacobians import write_rows
-from vinesim.kernels.worlds.row_solver import solve_few_rows, solve_many_rows
 from vinesim.kernels.contact.structs import (
     Candidates,
     Capsules,
@@ -26,30 +25,6 @@ from vinesim.kernels.contact.structs import (
     RigidBodies,
     Rows,
     WarmStart,
-)
-from vinesim.kernels.worlds.narrowphase import WorldContacts
-from vinesim.kernels.worlds.dense_solver import (
-    FIRST_SWEEPS,
-    MOST_NEWTON_CONTACTS,
-    WorldSearch,
-    WorldSystem,
-    copy_rows,
-    solve_world,
-    synchronize_lanes,
-    update_velocities,
-)
-from vinesim.kernels.worlds.views import (
-    part_of_rigid,
-    part_of_search,
-    part_of_system,
-    view_contacts,
-    view_int,
-    view_int_from,
-    view_rows,
-    view_search,
-    view_system,
-    view_warm_start,
-    world_and_entry,
 )
 from vinesim.kernels.plants.prediction import predict_tree
 from vinesim.kernels.plants.structs import (
@@ -62,6 +37,30 @@ from vinesim.kernels.plants.structs import (
     Scratch,
     SolverParameters,
     WrenchScratch,
+)
+from vinesim.kernels.worlds.dense_solver import (
+    FIRST_SWEEPS,
+    MOST_NEWTON_CONTACTS,
+    WorldSearch,
+    WorldSystem,
+    copy_rows,
+    solve_world,
+    synchronize_lanes,
+    update_velocities,
+)
+from vinesim.kernels.worlds.narrowphase import WorldContacts
+from vinesim.kernels.worlds.row_solver import solve_few_rows, solve_many_rows
+from vinesim.kernels.worlds.views import (
+    part_of_rigid,
+    part_of_search,
+    part_of_system,
+    view_contacts,
+    view_int_from,
+    view_rows,
+    view_search,
+    view_system,
+    view_warm_start,
+    world_and_entry,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -431,7 +430,9 @@ def apply_impulses_to_trees(
             slip_v = system.velocity[3 * c + 2] - rows.bias[3 * c + 2]
             body = contacts.body[c]
             store_contact(c, slip_u, slip_v, parameters, rows.impulse, contacts, warm_start)
-            body_wrench_out[body] = body_wrench_out[body] + wrench_at(body_q[body], contacts.point[c], contacts.force[c])
+            body_wrench_out[body] = body_wrench_out[body] + wrench_at(
+                body_q[body], contacts.point[c], contacts.force[c]
+            )
         apply_loaded_wrenches(
             tree,
             count,

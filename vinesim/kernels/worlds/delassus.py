@@ -10,11 +10,11 @@ import warp as wp
 from vinesim.kernels.contact.body_motion import to_single
 from vinesim.kernels.contact.jacobians import row_columns
 from vinesim.kernels.contact.structs import Contacts, Geoms, Rows
-from vinesim.kernels.worlds.narrowphase import WorldContacts
-from vinesim.kernels.worlds.dense_solver import WorldSystem
-from vinesim.kernels.worlds.views import view_contacts, view_rows, view_system, view_table, world_and_entry
 from vinesim.kernels.plants.spatial import cross_rows, symmetric
 from vinesim.kernels.plants.structs import ArticulationModel, Factors
+from vinesim.kernels.worlds.dense_solver import WorldSystem
+from vinesim.kernels.worlds.narrowphase import WorldContacts
+from vinesim.kernels.worlds.views import view_contacts, view_rows, view_system, view_table, world_and_entry
 
 wp.set_module_options({"enable_backward": False})
 

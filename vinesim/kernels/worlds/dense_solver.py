@@ -194,7 +194,9 @@ def write_sliding_row(i: int, listed: wp.int64, size: int, system: WorldSystem, 
 
 
 @wp.func
-def write_newton_system(listed: wp.int64, lane: int, lanes: int, size: int, system: WorldSystem, search_out: WorldSearch):
+def write_newton_system(
+    listed: wp.int64, lane: int, lanes: int, size: int, system: WorldSystem, search_out: WorldSearch
+):
     """Write the linear system for the present states of the listed contacts, which are the closed ones. Open contacts
     have no impulse.
 
