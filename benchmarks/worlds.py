@@ -20,10 +20,10 @@ import numpy as np
 import warp as wp
 
 from vinesim.core import frames
+from vinesim.learn.arm import AXES, arm
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
-from vinesim.scene.values import Drive, RobotSpec
 from vinesim.worlds.plants import plants_of_worlds
 from vinesim.worlds.worlds import Worlds
 
@@ -33,7 +33,8 @@ HEIGHT = 1.2
 BAR = (0.9, 1.12)
 """Position x, z [m] of the bar's axis, 8 cm below the canes and 0.3 m from where they begin."""
 BAR_RADIUS = 0.012
-AXES = ("0 0 1", "0 1 0", "0 0 1", "0 1 0", "0 0 1", "0 1 0", "1 0 0")
+BASE = (-0.6, 0.0, 0.5)
+"""[m] Place of the base of the arm."""
 
 
 def cane(number: int, bodies: int = 16) -> TreeBuilder:
@@ -68,44 +69,6 @@ def plants(canes: int, *, touched: bool) -> Model:
     return assemble([cane(number) for number in range(canes)], **fixed)
 
 
-def arm() -> RobotSpec:
-    """Returns an arm of seven joints with two fingers, on a base that stands 0.5 m above the ground."""
-
-    def link(name: str, mass: float, shape: str = "", at: str = "0 0 0", rpy: str = "0 0 0") -> str:
-        i = 0.004 * mass
-        collision = (
-            f'<collision><origin xyz="{at}" rpy="{rpy}"/><geometry>{shape}</geometry></collision>' if shape else ""
-        )
-        return (
-            f'<link name="{name}"><inertial><origin xyz="{at}"/><mass value="{mass}"/>'
-            f'<inertia ixx="{i}" iyy="{i}" izz="{i}" ixy="0" ixz="0" iyz="0"/></inertial>{collision}</link>'
-        )
-
-    def joint(name: str, kind: str, parent: str, child: str, at: str, axis: str, limit: float) -> str:
-        return (
-            f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/><origin xyz="{at}"/>'
-            f'<axis xyz="{axis}"/><limit lower="{-limit}" upper="{limit}" effort="200" velocity="5"/>'
-            f'<dynamics damping="1"/></joint>'
-        )
-
-    parts = [link("base_footprint", 5.0)]
-    drives = []
-    parent = "base_footprint"
-    for i, axis in enumerate(AXES):
-        name = f"link_{i}"
-        parts.append(link(name, 1.5, '<cylinder radius="0.04" length="0.13"/>', "0.065 0 0", "0 1.5707963 0"))
-        parts.append(joint(f"joint_{i}", "revolute", parent, name, "0.15 0 0", axis, 2.5))
-        drives.append(Drive(f"joint_{i}", 300.0, 30.0, 200.0, 5.0, -2.5, 2.5))
-        parent = name
-    for side, y in (("left", 0.03), ("right", -0.03)):
-        parts.append(link(side, 0.1, '<box size="0.08 0.012 0.024"/>'))
-        parts.append(joint(f"{side}_finger", "prismatic", parent, side, f"0.16 {y} 0", "0 1 0", 0.03))
-        drives.append(Drive(f"{side}_finger", 500.0, 20.0, 40.0, 1.0, -0.03, 0.03))
-    urdf = f'<robot name="arm">{"".join(parts)}</robot>'
-    pose = frames.pose(np.array([-0.6, 0.0, 0.5]))
-    return RobotSpec("arm", 0, urdf, "base_footprint", pose, tuple(drives), np.zeros(len(drives)))
-
-
 def seconds_a_step(launch: Any, steps: int, device: str) -> float:
     """Returns the wall time [s] of one of ``steps`` steps, after as many that are not timed."""
     launch(steps)
@@ -120,7 +83,7 @@ def ours(count: int, device: str, steps: int, canes: int, *, touched: bool) -> d
     """Returns the measurement of :class:`Worlds`."""
     began = time.perf_counter()
     model = plants_of_worlds([plants(canes, touched=touched)], count)
-    worlds = Worlds(model, count, robots=[arm()], device=device)
+    worlds = Worlds(model, count, robots=[arm(BASE)], device=device)
     worlds.step(1)
     wp.synchronize_device(device)
     started = time.perf_counter() - began
@@ -217,7 +180,8 @@ def peer_scene(*, touched: bool) -> str:
     servos = "".join(f'<position joint="j{i}" kp="300" kv="30"/>' for i in range(len(AXES)))
     servos += "".join(f'<position joint="{side}" kp="500" kv="20"/>' for side in "lr")
     return (
-        '<mujoco><option timestep="0.01" integrator="discrete" iterations="20"/><default><geom friction="0.8"/></default>'
+        '<mujoco><option timestep="0.01" integrator="discrete" iterations="20"/>'
+        '<default><geom friction="0.8"/></default>'
         f'<worldbody><geom type="plane" size="5 5 .1"/>{bar}{body}</worldbody><actuator>{servos}</actuator></mujoco>'
     )
 

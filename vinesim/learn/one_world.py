@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -13,7 +13,7 @@ from vinesim.learn.reach import ReachEnv
 class ReachOne(gymnasium.Env[np.ndarray, np.ndarray]):
     """:class:`ReachEnv` with one world. ``options``: arguments of :class:`ReachEnv` except ``num_envs``."""
 
-    metadata = {"render_modes": []}
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
 
     def __init__(self, **options: Any) -> None:
         self.vector = ReachEnv(1, **options)

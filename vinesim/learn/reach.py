@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -61,7 +61,7 @@ class ReachEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         max_episode_steps: number of actions after which an episode is truncated.
     """
 
-    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
+    metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
 
     def __init__(
         self,
@@ -169,7 +169,7 @@ class ReachEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin an episode in all worlds. ``seed``: of the choice of bunches; see :class:`gymnasium.vector.VectorEnv`."""
+        """Begin an episode in all worlds; see :class:`gymnasium.vector.VectorEnv`. ``seed``: chooses the bunches."""
         if isinstance(seed, list):
             raise ValueError("seed: give one number for all worlds")
         super().reset(seed=seed)

@@ -171,8 +171,8 @@ class BatchContacts:
         return wp.zeros(shape, dtype=dtype, device=self._device)
 
     def _take_over_geoms(self, rigid: RigidArrays) -> None:
-        """Copy the geoms to the device: first the geoms that can move, of all worlds, then the static geoms. Each static
-        geom and each block of static geoms has a bounding box.
+        """Copy the geoms to the device: first the geoms that can move, of all worlds, then the static geoms. Each
+        static geom and each block of static geoms has a bounding box.
 
         The ground's box has no lower end.
         """

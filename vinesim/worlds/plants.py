@@ -73,7 +73,7 @@ def _gathered(pool: Model, trees: np.ndarray) -> Model:
         rows[kind] = order[spans(begin, end - begin)]
         moved[kind] = np.repeat(shift, end - begin)
     sizes = {kind: len(rows[kind]) for kind in rows}
-    gathered = Model.allocate(**({kind: n for kind, n in pool.counts().items()} | sizes))
+    gathered = Model.allocate(**(pool.counts() | sizes))
     for name, dim in Model.array_fields().items():
         kind = dim.shape[0]
         if kind not in _STANDING:
