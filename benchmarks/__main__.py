@@ -41,11 +41,11 @@ def _picking(by: str, seeds: int, first: int, record: pathlib.Path | None) -> It
     return _call("picking:picking")(by, range(first, first + seeds), record, _announce)
 
 
-def _pruning(seeds: int, first: int, spurs: int, record: pathlib.Path | None) -> Iterator[Measurement]:
+def _pruning(by: str, seeds: int, first: int, spurs: int, record: pathlib.Path | None) -> Iterator[Measurement]:
     for option, value, least in (("seeds", seeds, 1), ("first", first, 0), ("spurs", spurs, 0)):
         if value < least:
             raise UsageError(f"--{option} is {value}: give {least} or more")
-    return _call("pruning:pruning")(range(first, first + seeds), spurs, record, _announce)
+    return _call("pruning:pruning")(by, range(first, first + seeds), spurs, record, _announce)
 
 
 def _kill(times: int, seed: int) -> Iterator[Measurement]:
@@ -114,6 +114,7 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
         _pruning,
         "prune a dormant vine by rule, in simulated time",
         {
+            "by": {"default": "truth", "choices": ["truth", "cameras"], "help": "what the robot knows of the plants"},
             "seeds": {"type": int, "default": 1, "help": "number of vineyards"},
             "first": {"type": int, "default": 1, "help": "seed of the first vineyard"},
             "spurs": {"type": int, "default": 0, "help": "largest number of spurs of each vine; 0: all"},

@@ -1,6 +1,7 @@
 """``python -m benchmarks pruning``: prunes a dormant vine of scene ``winter_spur`` by rule, in simulated time.
 
-Each seed is a vineyard; the robot prunes the vine nearest to its start place, with poses of canes from the simulation.
+Each seed is a vineyard; the robot prunes the vine nearest to its start place, with poses of canes from the simulation
+(``--by cameras``: :mod:`benchmarks.seen_pruning`).
 Measured are the cuts that were made, their distance from the wanted places, other canes that were cut, the largest
 force on a bud of the kept spurs, and the seconds. ``--record FILE`` keeps a line of JSON for each seed, so that a long
 run can be continued.
@@ -18,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.seen_pruning import prune_seen, seen_measurements
 from vinesim.api.picking import ROBOT
 from vinesim.client.tasks.pruning import PruningRule, plan_pruning
 from vinesim.client.tasks.start_poses import spawn_pose
@@ -39,24 +41,26 @@ LARGEST_FORCE = 5.0
 
 
 def pruning(
-    seeds: Sequence[int], spurs: int, record: pathlib.Path | None, announce: Callable[[str], None]
+    by: str, seeds: Sequence[int], spurs: int, record: pathlib.Path | None, announce: Callable[[str], None]
 ) -> Iterator[Measurement]:
     """Measure cuts, kept canes and buds, and seconds. ``spurs``: largest number of spurs of each vine, 0: all."""
     known = {}
     if record is not None and record.exists():
-        known = {one["seed"]: one for one in map(json.loads, record.read_text().splitlines()) if one["spurs"] == spurs}
+        old = map(json.loads, record.read_text().splitlines())
+        known = {one["seed"]: one for one in old if one["spurs"] == spurs and one.get("by", "truth") == by}
     lines = []
     for seed in seeds:
         line = known.get(seed)
         if line is None:
             start = time.monotonic()
-            line = prune_one(seed, spurs)
-            announce(f"seed {seed}: {line['right']} of {line['wanted']} cuts, {time.monotonic() - start:.0f} s")
+            line = prune_one(seed, spurs) if by == "truth" else prune_seen(seed, spurs)
+            done, planned = (line["right"], line["wanted"]) if by == "truth" else (line["made"], line["planned"])
+            announce(f"seed {seed}: {done} of {planned} cuts, {time.monotonic() - start:.0f} s")
             if record is not None:
                 with record.open("a") as file:
                     file.write(json.dumps(line) + "\n")
         lines.append(line)
-    yield from measurements(lines)
+    yield from measurements(lines) if by == "truth" else seen_measurements(lines)
 
 
 def prune_one(seed: int, spurs: int) -> dict[str, Any]:
