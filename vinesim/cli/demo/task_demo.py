@@ -14,7 +14,7 @@ from vinesim.cli.demo.summary import job_summary, write_summary
 from vinesim.client.programs import START_TIMEOUT, program_group
 from vinesim.client.tasks.harvesting import HarvestOptions
 from vinesim.client.tasks.planning import plan_meeting
-from vinesim.client.tasks.registry import UnknownTask
+from vinesim.client.tasks.registry import UnknownTask, validate_sight
 from vinesim.client.tasks.seen_harvest import SURVEY_TIME
 from vinesim.client.tasks.start_poses import bunch_centres, start_pose
 from vinesim.core.errors import writing
@@ -37,6 +37,8 @@ TIME_LIMIT = 120.0
 
 PRUNING_TIME = 400.0
 """Default limit of the simulated time of pruning one vine [s]."""
+SEEN_PRUNING_TIME = 600.0
+"""As :data:`PRUNING_TIME`, by sight: with the time for looking around and for second tries [s]."""
 SETTLE_TIME = 2.0
 """Time after the time-out of a task itself [s], so that its own reason is reported."""
 
@@ -58,6 +60,7 @@ def run_job(
     """Let one robot do a task, and write the results into ``out``. Returns 0 if the task was done, 5 otherwise."""
     if job not in JOBS:
         raise UnknownTask(f"no job {job!r}; give push, {', '.join(list(JOBS)[:-1])} or {list(JOBS)[-1]}")
+    validate_sight(job, see)
     console = Console(stderr=True, markup=False)
     check_device(device)
     default_robot, done_key = JOBS[job]
@@ -145,7 +148,7 @@ def run_job(
 def time_limit(job: str, harvest: HarvestOptions, see: bool) -> float:
     """Returns the default limit of the simulated time of a task [s]: a harvest by sight needs time to look around."""
     if job == "prune":
-        return PRUNING_TIME
+        return SEEN_PRUNING_TIME if see else PRUNING_TIME
     if job != "pick":
         return TIME_LIMIT
     return max(TIME_LIMIT, harvest.timeout + (SURVEY_TIME if see else 0.0)) + SETTLE_TIME

@@ -1,4 +1,7 @@
-"""Pruning by sight: the robot looks for canes with its own camera, plans the cuts by the rule, cuts, and looks again.
+"""Pruning by sight: the robot looks for canes with its own camera, plans the cuts by the rule, and cuts.
+
+Where its blades felt no wood part, it looks again and corrects the place. A cane that is cut still hangs in its ties, a
+centimetre above its stump. The detector follows it across such gaps, so that only the blades tell whether it is cut.
 
 It knows its base and joints, the forces of its blades, the trellis, and where the vines are planted. It knows nothing
 else of the simulation. What it does not see, the rule counts as wanted: the lengths of canes, and their distance from
@@ -20,7 +23,7 @@ from vinesim.core import frames
 from vinesim.robot.control.waypoint_follower import WaypointFollower
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.pick_seen import look
-from vinesim.robot.tasks.prune import PruneCanes, PruneStop, WoodCut
+from vinesim.robot.tasks.prune import DOWN, CutResult, PruneCanes, PruneStop, WoodCut
 from vinesim.robot.tasks.sight import CaneEyes, RowMap, SeenCane
 from vinesim.robot.tasks.task import TaskFailed
 from vinesim.scene.ids import Organ
@@ -35,6 +38,8 @@ GAZE_AHEAD = 0.25
 """[m] Distance along the row, ahead of the base, of the place at which it looks."""
 GAZE_ABOVE = 0.17
 """[m] Height of that place above the fruiting wire."""
+TRIES = 2
+"""Number of times that a cut is tried."""
 LIFT_MARGIN = 0.02
 """[m] Distance of the lift from its lower end while the robot looks: from there canes are seen from the side."""
 SAME_CANE = 0.014
@@ -45,6 +50,10 @@ FEWEST_SIGHTS = 2
 """Number of pictures in which a cane must be seen."""
 SPUR_ROOM = 0.055
 """[m] Distance between the bases of canes on one spur: an internode of a spur is up to 32 mm long."""
+STOWED = (0.32, 0.36, 0.62)
+"""[m] Place of the hand in the frame of the base while the robot looks at what it has cut: below the line of sight."""
+STOW_TIME = 4.0
+"""[s] Longest time in which the hand goes there."""
 VINE_MARGIN = 0.1
 """[m] Way before and beyond the stretch of a vine from which the robot looks."""
 ROW_ROOM = 0.42
@@ -202,6 +211,11 @@ def spurs(canes: list[RememberedCane]) -> list[list[RememberedCane]]:
     return groups
 
 
+def cut_along(seen: SeenCane, rule: PruningRule, is_kept: bool) -> float:
+    """Returns the way [m] from the base of a cane to where the rule cuts it."""
+    return float(seen.nodes[rule.buds - 1]) + ABOVE_BUD if is_kept else REMOVED_AT * float(seen.nodes[0])
+
+
 def plan_cuts(canes: list[RememberedCane], rule: PruningRule, ground: float) -> list[list[SeenCut]]:
     """Returns the cuts of ``rule`` for each spur: first those that shorten kept canes. ``ground`` [m]: height of the
     vine's foot. The rule chooses by what is seen: thickness and height."""
@@ -220,8 +234,7 @@ def plan_cuts(canes: list[RememberedCane], rule: PruningRule, ground: float) -> 
             is_kept = rank < rule.keep
             if is_kept and len(seen.nodes) < rule.buds:
                 continue
-            along = float(seen.nodes[rule.buds - 1]) + ABOVE_BUD if is_kept else REMOVED_AT * float(seen.nodes[0])
-            cuts.append(SeenCut(group[index].number, seen.at(along), is_kept))
+            cuts.append(SeenCut(group[index].number, seen.at(cut_along(seen, rule, is_kept)), is_kept))
         found.append(cuts)
     return found
 
@@ -258,13 +271,67 @@ class PruneBySight(PruneCanes):
         return super().report() | {"canes_seen": len(self.memory.sure()), "largest_error_m": None}
 
     def run(self) -> Iterator[str]:
-        """The task: look along the vine, plan, cut, and look again. It fails if a cut was not made."""
+        """The task: look along the vine, plan and cut. It fails if a cut was not made."""
         yield from self._survey()
         self.stops = self._stops()
         if not self.stops:
             raise TaskFailed("the camera shows no cane that the robot can prune; give a scene with a date in winter")
         self._kept = {cut.cane for stop in self.stops for cut in stop.cuts if cut.is_kept}
-        yield from super().run()
+        for stop in self.stops:
+            yield from self._prune_at(stop)
+        missed = [one for one in self.results if not one.done]
+        if missed:
+            raise TaskFailed(f"{len(missed)} of {len(self.results)} cuts were not made; the first: {missed[0].reason}")
+
+    def _prune_at(self, stop: PruneStop) -> Iterator[str]:
+        """Make the cuts of a stop. Where the blades felt no wood part, look again and try once more."""
+        yield from self._go_to(stop.base_pose)
+        cuts = stop.cuts
+        results: dict[int, CutResult] = {}
+        for _ in range(TRIES):
+            for cut in cuts:
+                start = self.time
+                reason = ""
+                try:
+                    yield from self._make(cut)
+                except TaskFailed as failure:
+                    reason = f"{self.phase}: {failure}"
+                yield from self._withdraw(cut)
+                spent = results[cut.cane].seconds if cut.cane in results else 0.0
+                seconds = round(spent + self.time - start, 2)
+                results[cut.cane] = CutResult(cut.cane, cut.is_kept, not reason, math.nan, seconds, reason)
+            cuts = tuple(cut for cut in cuts if not results[cut.cane].done)
+            if not cuts:
+                break
+            yield from self._stow()
+            yield from self._look_at(
+                CANE_AHEAD + float((stop.base_pose[:3] - self.stretch.foot)[:2] @ self.stretch.along)
+            )
+            self._correct(cuts, self._eyes.canes(self.stretch.row).canes)
+        self.results += results.values()
+
+    def _correct(self, cuts: tuple[WoodCut, ...], canes: tuple[SeenCane, ...]) -> None:
+        """Correct the places of cuts by what the robot sees now; where a cane is not seen again, its place remains."""
+        for cut in cuts:
+            known = self.memory.canes[cut.cane].seen
+            near = [one for one in canes if len(one.nodes) >= self.rule.buds]
+            apart = [axis_distance(one, known.points) for one in near]
+            if apart and min(apart) < SAME_CANE:
+                seen = near[int(np.argmin(apart))]
+                place = seen.at(cut_along(seen, self.rule, cut.is_kept))
+                self.plan[cut.cane] = dataclasses.replace(self.plan[cut.cane], place=place)
+
+    def _stow(self) -> Iterator[str]:
+        """Bring the hand below the line of sight."""
+        self.arm.reset()
+        end = self.time + STOW_TIME
+        across = np.append(self.stretch.across, 0.0)
+        while self.time < end:
+            place = frames.compose(self.robot.rigid.base_state(self.robot.name)[0], frames.pose(STOWED))[:3]
+            if self.arm.distance_to(place) < 0.05:
+                return
+            self.arm.move_towards(place, across, DOWN, speed=0.35, working_height=float(place[2]))
+            yield "stow"
 
     def _survey(self) -> Iterator[str]:
         """Drive along the vine and look at it from several places; drive back to the start."""
