@@ -486,7 +486,10 @@ def _seen(
     share = 1.0 + depth / (rays @ view.across)
     surface = eye + share[:, None] * rays
     scale = float(np.median(share[known]))
-    diameter = scale * _thickness(axis, strip)
+    # a round cane that is seen obliquely is wider on the plane than it is
+    level = rays * np.array([1.0, 1.0, 0.0])
+    turned = np.abs(level @ view.across) / np.linalg.norm(level, axis=1)
+    diameter = scale * float(np.median(turned[known])) * _thickness(axis, strip)
     points = surface + 0.5 * diameter * frames.normalize(rays)
     start = int(np.searchsorted(axis.way, base))
     points = points[start:]

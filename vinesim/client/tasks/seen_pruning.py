@@ -177,8 +177,15 @@ class CaneMemory:
                 self.canes[number].sights.append(seen)
 
     def sure(self) -> list[RememberedCane]:
-        """Returns the canes that were seen in :data:`FEWEST_SIGHTS` pictures or more."""
-        return [one for one in self.canes if len(one.sights) >= FEWEST_SIGHTS]
+        """Returns the canes that were seen in :data:`FEWEST_SIGHTS` pictures or more. Of canes at one place, which is
+        one cane seen differently, the one with most sights counts."""
+        found: list[RememberedCane] = []
+        for one in sorted(self.canes, key=lambda one: -len(one.sights)):
+            if len(one.sights) < FEWEST_SIGHTS:
+                break
+            if all(axis_distance(one.seen, other.seen.points) > SAME_CANE for other in found):
+                found.append(one)
+        return sorted(found, key=lambda one: one.number)
 
 
 def axis_distance(seen: SeenCane, axis: np.ndarray) -> float:
