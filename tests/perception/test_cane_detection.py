@@ -87,7 +87,7 @@ def test_a_straight_cane_has_its_diameter_base_direction_and_nodes(diameter):
         assert np.arccos(along @ way) < 0.05
         assert seen.diameter == pytest.approx(diameter, abs=0.0015)
         for number in (0, 1):
-            assert (seen.at(seen.nodes[number]) - base) @ way == pytest.approx(nodes[number], abs=0.006)
+            assert (seen.at(seen.nodes[number]) - base) @ way == pytest.approx(nodes[number], abs=0.008)
 
 
 def test_of_two_canes_on_a_spur_the_one_that_follows_it_is_the_upper_one():
@@ -130,7 +130,7 @@ def simulation() -> vinesim.Simulation:
 @pytest.fixture(scope="module")
 def pictures(simulation) -> list[CameraFrame]:
     camera = vinesim.Camera("d435", quality="fast")
-    places = (2.85, 3.15, 3.45)
+    places = (2.95, 3.35)
     return [camera.render(simulation, vinesim.look_at((x + 0.10, 1.93, 1.35), (x + 0.30, 2.6, 1.02))) for x in places]
 
 
