@@ -36,8 +36,8 @@ def test_a_cane_that_is_seen_twice_is_remembered_once_and_one_seen_once_does_not
 
 
 def test_the_lower_cane_of_a_spur_stays_and_is_cut_above_its_second_bud():
-    picture = (seen(3.0, 0.900, -0.3), seen(3.005, 0.928, 0.1), seen(3.2, 0.91))
-    canes = remembered(picture, picture).sure()
+    pictures = [(seen(3.0, 0.900, -0.3), seen(3.005, 0.928, 0.1), seen(3.2, 0.91)) for _ in range(2)]
+    canes = remembered(*pictures).sure()
     assert sorted(len(group) for group in spurs(canes)) == [1, 2]
     plan = {cut.cane: cut for cuts in plan_cuts(canes, RULE, 0.0) for cut in cuts}
     assert [plan[number].is_kept for number in (0, 1, 2)] == [True, False, True]
