@@ -38,9 +38,11 @@ def _picking(by: str, seeds: int, first: int, record: pathlib.Path | None, jobs:
     return _call("picking:picking")(by, range(first, first + seeds), record, jobs, _announce)
 
 
-def _pruning(seeds: int, first: int, spurs: int, record: pathlib.Path | None, jobs: int) -> Iterator[Measurement]:
+def _pruning(
+    by: str, seeds: int, first: int, spurs: int, record: pathlib.Path | None, jobs: int
+) -> Iterator[Measurement]:
     _require(("seeds", seeds, 1), ("first", first, 0), ("spurs", spurs, 0), ("jobs", jobs, 1))
-    return _call("pruning:pruning")(range(first, first + seeds), spurs, record, jobs, _announce)
+    return _call("pruning:pruning")(by, range(first, first + seeds), spurs, record, jobs, _announce)
 
 
 def _require(*options: tuple[str, int, int]) -> None:
@@ -127,6 +129,7 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
         _pruning,
         "prune a dormant vine by rule, in simulated time",
         {
+            "by": {"default": "truth", "choices": ["truth", "cameras"], "help": "what the robot knows of the plants"},
             "seeds": {"type": int, "default": 1, "help": "number of vineyards"},
             "first": {"type": int, "default": 1, "help": "seed of the first vineyard"},
             "spurs": {"type": int, "default": 0, "help": "largest number of spurs of each vine; 0: all"},

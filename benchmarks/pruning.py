@@ -1,6 +1,7 @@
 """``python -m benchmarks pruning``: prunes a dormant vine of scene ``winter_spur`` by rule, in simulated time.
 
-Each seed is a vineyard; the robot prunes the vine nearest to its start place, with poses of canes from the simulation.
+Each seed is a vineyard; the robot prunes the vine nearest to its start place, with poses of canes from the simulation
+(``--by cameras``: :mod:`benchmarks.seen_pruning`).
 Measured are the cuts that were made, their distance from the wanted places, other canes that were cut, the largest
 force on a bud of the kept spurs, and the seconds. ``--record FILE`` keeps a line of JSON for each seed, so that a long
 run can be continued. ``--jobs N`` runs seeds in N processes.
@@ -17,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.seen_pruning import prune_seen, seen_measurements
 from benchmarks.support.seed_runs import SeedRuns
 from vinesim.api.picking import ROBOT
 from vinesim.client.tasks.pruning import PruningRule, plan_pruning
@@ -39,17 +41,24 @@ LARGEST_FORCE = 5.0
 
 
 def pruning(
-    seeds: Sequence[int], spurs: int, record: pathlib.Path | None, jobs: int, announce: Callable[[str], None]
+    by: str,
+    seeds: Sequence[int],
+    spurs: int,
+    record: pathlib.Path | None,
+    jobs: int,
+    announce: Callable[[str], None],
 ) -> Iterator[Measurement]:
-    """Measure cuts, kept canes and buds, and seconds. ``spurs``: largest number of spurs of each vine, 0: all.
-    ``jobs``: number of processes."""
-    work = functools.partial(prune_one, spurs=spurs)
-    runs = SeedRuns(work, {"benchmark": "pruning", "spurs": spurs}, _summary, announce, record)
-    yield from measurements(runs.lines(seeds, jobs))
+    """Measure cuts, kept canes and buds, and seconds. ``by``: what the robot knows of the plants, "truth" or "cameras".
+    ``spurs``: largest number of spurs of each vine, 0: all. ``jobs``: number of processes."""
+    work = functools.partial(prune_one if by == "truth" else prune_seen, spurs=spurs)
+    runs = SeedRuns(work, {"benchmark": "pruning", "by": by, "spurs": spurs}, _summary, announce, record)
+    lines = runs.lines(seeds, jobs)
+    yield from measurements(lines) if by == "truth" else seen_measurements(lines)
 
 
 def _summary(line: dict[str, Any]) -> str:
-    return f"{line['right']} of {line['wanted']} cuts"
+    done, planned = ("right", "wanted") if line["by"] == "truth" else ("made", "planned")
+    return f"{line[done]} of {line[planned]} cuts"
 
 
 def prune_one(seed: int, spurs: int) -> dict[str, Any]:

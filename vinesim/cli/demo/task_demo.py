@@ -15,7 +15,7 @@ from vinesim.client.programs import START_TIMEOUT, program_group
 from vinesim.client.tasks.harvesting import HarvestOptions
 from vinesim.client.tasks.planning import plan_meeting
 from vinesim.client.tasks.pruning import PruningRule, prune
-from vinesim.client.tasks.registry import UnknownTask
+from vinesim.client.tasks.registry import UnknownTask, validate_sight
 from vinesim.client.tasks.seen_harvest import SURVEY_TIME
 from vinesim.client.tasks.start_poses import bunch_centres, start_pose
 from vinesim.core.errors import writing
@@ -40,6 +40,8 @@ PRUNING_TIME = 400.0
 """Default limit of the simulated time of pruning one vine [s]."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
+SEEN_PRUNING_TIME = 600.0
+"""As :data:`PRUNING_TIME`, by sight: with the time for looking around and for second tries [s]."""
 SETTLE_TIME = 2.0
 """Time after the time-out of a task itself [s], so that its own reason is reported."""
 
@@ -62,6 +64,7 @@ def run_job(
     after Ctrl-C, 5 otherwise."""
     if job not in JOBS:
         raise UnknownTask(f"no job {job!r}; give push, {', '.join(list(JOBS)[:-1])} or {list(JOBS)[-1]}")
+    validate_sight(job, see)
     console = Console(stderr=True, markup=False)
     check_device(device)
     default_robot, done_key = JOBS[job]
@@ -157,7 +160,7 @@ def run_job(
 def time_limit(job: str, harvest: HarvestOptions, see: bool) -> float:
     """Returns the default limit of the simulated time of a task [s]: a harvest by sight needs time to look around."""
     if job == "prune":
-        return PRUNING_TIME
+        return SEEN_PRUNING_TIME if see else PRUNING_TIME
     if job != "pick":
         return TIME_LIMIT
     return max(TIME_LIMIT, harvest.timeout + (SURVEY_TIME if see else 0.0)) + SETTLE_TIME

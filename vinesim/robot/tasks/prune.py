@@ -19,7 +19,7 @@ from vinesim.robot.control.cartesian_controller import CartesianController, axes
 from vinesim.robot.control.waypoint_follower import WaypointFollower
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.drives.joint_servos import CommandError
-from vinesim.robot.tasks.mouth_place import ENOUGH, MouthPlace, WoodAround, hand_shape, mouth_place
+from vinesim.robot.tasks.mouth_place import ENOUGH, MouthPlace, Wood, WoodAround, hand_shape, mouth_place
 from vinesim.robot.tasks.task import Task, TaskFailed
 from vinesim.scene.values import Detachment
 from vinesim.world import Physics
@@ -248,6 +248,10 @@ class PruneCanes(Task):
     def _plan(self, cut: WoodCut, tried: Sequence[np.ndarray] = ()) -> MouthPlace:
         """Returns how the mouth takes a cane, among the wood around it as it is now."""
         wood = self._wood.around(self.physics.state, self._pose(cut), cut.cane, self._kept)
+        return self._place_of_mouth(cut, wood, tried)
+
+    def _place_of_mouth(self, cut: WoodCut, wood: Wood, tried: Sequence[np.ndarray]) -> MouthPlace:
+        """Returns how the mouth takes a cane among other ``wood``."""
         link, offset = self._mouth_pose
         mouth = frames.compose(self.robot.frame_pose(link), offset)
         hand = hand_shape(self.robot.rigid, self.robot.name, self._hand_links, mouth, self._half)
