@@ -12,13 +12,10 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from benchmarks.transfer import OPTIONS as TRANSFER_OPTIONS
+from benchmarks.support.announcement import announce
 from vinesim.cli.bench import print_measurement
 from vinesim.core.errors import UsageError
 from vinesim.scene.values import Measurement
-
-
-def _announce(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
 
 
 def _call(path: str) -> Callable[..., Iterator[Measurement]]:
@@ -35,14 +32,14 @@ def _asleep() -> Iterator[Measurement]:
 
 def _picking(by: str, seeds: int, first: int, record: pathlib.Path | None, jobs: int) -> Iterator[Measurement]:
     _require(("seeds", seeds, 1), ("first", first, 0), ("jobs", jobs, 1))
-    return _call("picking:picking")(by, range(first, first + seeds), record, jobs, _announce)
+    return _call("picking:picking")(by, range(first, first + seeds), record, jobs, announce)
 
 
 def _pruning(
     by: str, seeds: int, first: int, spurs: int, record: pathlib.Path | None, jobs: int
 ) -> Iterator[Measurement]:
     _require(("seeds", seeds, 1), ("first", first, 0), ("spurs", spurs, 0), ("jobs", jobs, 1))
-    return _call("pruning:pruning")(by, range(first, first + seeds), spurs, record, jobs, _announce)
+    return _call("pruning:pruning")(by, range(first, first + seeds), spurs, record, jobs, announce)
 
 
 def _require(*options: tuple[str, int, int]) -> None:
@@ -59,7 +56,7 @@ def _shared_harvest(scene: str, minutes: float, period: float, seed: int, replay
     for option, value in (("minutes", minutes), ("period", period)):
         if not 0.0 < value < 1e4:
             raise UsageError(f"--{option} is {value:g}: give more than 0, below 10000")
-    return _call("shared_harvest:shared_harvest")(scene, minutes, period, seed, replays, _announce)
+    return _call("shared_harvest:shared_harvest")(scene, minutes, period, seed, replays, announce)
 
 
 def _kill(times: int, seed: int) -> Iterator[Measurement]:
@@ -67,7 +64,7 @@ def _kill(times: int, seed: int) -> Iterator[Measurement]:
         raise UsageError(f"--times is {times}: give 1 or more")
     if seed < 0:
         raise UsageError(f"--seed is {seed}: give 0 or more")
-    return _call("kill:kill")(times, seed, _announce)
+    return _call("kill:kill")(times, seed, announce)
 
 
 def _example_signals(runs: int, seed: int) -> Iterator[Measurement]:
@@ -75,7 +72,7 @@ def _example_signals(runs: int, seed: int) -> Iterator[Measurement]:
         raise UsageError(f"--runs is {runs}: give 1 or more")
     if seed < 0:
         raise UsageError(f"--seed is {seed}: give 0 or more")
-    return _call("example_signals:example_signals")(runs, seed, _announce)
+    return _call("example_signals:example_signals")(runs, seed, announce)
 
 
 def _fuzz(messages: int, false_messages: int) -> Iterator[Measurement]:
@@ -89,7 +86,7 @@ def _file_fuzz(files: int, seed: int, first: int, kinds: str) -> Iterator[Measur
     for option, value in (("files", files), ("seed", seed), ("first", first)):
         if value < 0:
             raise UsageError(f"--{option} is {value}: give 0 or more")
-    return _call("file_fuzz:file_fuzz")(files, seed, first, kinds, _announce)
+    return _call("file_fuzz:file_fuzz")(files, seed, first, kinds, announce)
 
 
 def _soak(minutes: float, real_time_factor: float | None) -> Iterator[Measurement]:
@@ -97,7 +94,7 @@ def _soak(minutes: float, real_time_factor: float | None) -> Iterator[Measuremen
         raise UsageError(f"--minutes is {minutes:g}: give more than 0")
     if real_time_factor is not None and not 0.01 <= real_time_factor <= 1.0:
         raise UsageError(f"--real-time-factor is {real_time_factor:g}: give 0.01 to 1")
-    return _call("soak:soak")(minutes, real_time_factor, _announce)
+    return _call("soak:soak")(minutes, real_time_factor, announce)
 
 
 def _coverage(seeds: int, first: int, plants: str, tracks: str) -> Iterator[Measurement]:
@@ -105,7 +102,7 @@ def _coverage(seeds: int, first: int, plants: str, tracks: str) -> Iterator[Meas
         raise UsageError(f"--seeds is {seeds}: give 1 or more")
     if first < 0:
         raise UsageError(f"--first is {first}: give 0 or more")
-    return _call("coverage:coverage")(seeds, first, plants, tracks, _announce)
+    return _call("coverage:coverage")(seeds, first, plants, tracks, announce)
 
 
 def _later(path: str) -> Callable[..., Iterator[Measurement]]:
