@@ -7,8 +7,9 @@ Keys: the poses of an actor are divided among ``pose/<x>/<y>/<actor>``, which co
 it is, to the more of the other keys (:data:`vinesim.net.replication.interest.POSE_LAYERS`). Coarse poses under
 ``a/<actor>/far`` go to all. Queries use ``hello/<actor>``, ``robot/<actor>`` and ``clock/<actor>``.
 
-A peer is *near* while its poses arrive and it is within :data:`vinesim.net.replication.interest.BODY_DISTANCE`, with
-hysteresis. Of other peers only the hello and the last known position are known.
+A peer is *near* while its poses arrive, it is within :data:`vinesim.net.replication.interest.BODY_DISTANCE`, with
+hysteresis, and it is one of the nearest :data:`vinesim.net.replication.interest.MAX_BODIES`. Of other peers only the
+hello and the last known position are known.
 """
 
 from __future__ import annotations
@@ -138,6 +139,8 @@ class PeerRegistry:
         bus.subscribe(interest.FAR_KEY.format(actor="*"), KEEP_LAST_1)
         self._thinning = self._far_thinning = 1
         """Whole numbers by which the rates of the first layer and of coarse poses are divided."""
+        self._reach = interest.BODY_DISTANCE
+        """Distance within which a peer becomes near [m]; smaller in a crowd."""
         self._interest_due = self._crowd_due = _LONG_AGO
         self._pose_number: int | None = None
         """Number of the last pose that was due; None before the first one."""
@@ -351,7 +354,7 @@ class PeerRegistry:
         fit the peer.
         """
         name = peer.hello.name
-        if is_coarse or (name not in self.near and self._away(update.base_q) > interest.BODY_DISTANCE):
+        if is_coarse or (name not in self.near and self._away(update.base_q) > self._reach):
             return peer.put(update, time)
         self.near[name] = peer
         return peer.receive(update, time)
@@ -393,7 +396,11 @@ class PeerRegistry:
         """Subscribe to more layers of the poses of near peers, the nearest ones first, and forget peers that are far
         now."""
         away = {name: self._away(actor.place) for name, actor in self.near.items() if actor.place is not None}
-        for rank, name in enumerate(sorted(away, key=lambda name: (away[name], name))):
+        order = sorted(away, key=lambda name: (away[name], name))
+        self._reach = interest.BODY_DISTANCE
+        if len(order) >= interest.MAX_BODIES:
+            self._reach = min(self._reach, interest.NEARER * away[order[interest.MAX_BODIES - 1]])
+        for rank, name in enumerate(order):
             actor = self.near[name]
             wanted = interest.count_layers(away[name], 1 + len(actor.near), rank)
             if wanted == 0:
