@@ -3,9 +3,9 @@
 
 **actors.** Every client has the whole physics, some of the actors, and a copy of every other actor. All actors stand
 within the distance in which they receive each other, in rows 1.2 m apart, each with a bunch above it and a box before
-it. Each actor picks its bunch, which falls to the ground, and pushes its box: robots with their base, people with their shins.
-When everything is at rest, the retained objects and their owners are compared between all clients. The bus is in memory
-and the clock simulated: the figures do not depend on the machine.
+it. Each actor picks its bunch, which falls to the ground, and pushes its box: robots with their base, people with their
+shins. When everything is at rest, the retained objects and their owners are compared between all clients. The bus is in
+memory and the clock simulated: the figures do not depend on the machine.
 
 **many_actors.** Whole clients without renderers, each with a session of its own on one of three linked routers. Each
 actor picks its bunch and pushes its box; at the end all clients have equal records. The world passes as fast as the
