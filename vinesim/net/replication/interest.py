@@ -79,7 +79,8 @@ class PoseLayer(NamedTuple):
     distance: float
     """Distance within which actors subscribe to the layer [m]."""
     nearest: int
-    """Largest number of other actors, the nearest ones, whose poses on this layer an actor receives."""
+    """Largest number of other actors, the nearest ones, whose poses on this layer an actor receives. For hysteresis it
+    keeps one more."""
 
 
 POSE_LAYERS = (
