@@ -147,8 +147,8 @@ class Client:
         return self._client.far_actors()
 
     def actor_pose(self, name: str) -> np.ndarray:
-        """Returns the pose [7] (m, quaternion xyzw) of the base of this client's robot or of a remote actor, by its
-        name. Raises ``KeyError`` for an unknown name."""
+        """Returns the pose [7] (m, quaternion xyzw) of the base of this client's robot or of a remote actor with a
+        body, by its name. Raises ``KeyError`` for another name. :attr:`far_actors` has the places of all others."""
         if name != self._client.name and name not in self._client.remote_actors:
             raise KeyError(f"no actor {name!r}; there are: {', '.join((self._client.name, *self.remote_actors))}")
         return self._client.physics.rigid.base_state(name)[0]

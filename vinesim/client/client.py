@@ -73,6 +73,10 @@ CLOCK_POLL_PERIOD = 0.005
 """Time between two checks for the server's first reply [s]."""
 
 
+BODY_KINDS = ("robot", "human")
+"""Kinds of actors that have bodies."""
+
+
 class Exchange(NamedTuple):
     """Two functions of a client for one kind of direct messages between actors: one makes the messages, one applies
     them."""
@@ -421,20 +425,18 @@ class Client:
     def _describe(self, name: str) -> Hello | None:
         """Returns the hello of a remote robot, with its URDF, or of a remote human. None: it is a spectator, or its
         description has not arrived yet."""
-        for replicator in self.replicators.values():
-            if (known := replicator.peers.get(name)) is not None:
-                return replicator.describe(name) if known.kind in ("robot", "human") else None
-        return None
+        knowing = next((one for one in self.replicators.values() if one.is_peer(name)), None)
+        hello = None if knowing is None else knowing.describe(name)
+        return hello if hello is not None and hello.kind in BODY_KINDS else None
 
     def far_actors(self) -> dict[str, np.ndarray]:
         """Returns the last known positions [3] m of the robots and humans of other clients that have no body here, by
         name, sorted: those that are far away, and those whose bodies are being made."""
-        replicator = self.replicator
-        kinds = {name: hello.kind for name, hello in replicator.peers.items()}
+        hellos = self.replicator.peers
         return {
             name: place
-            for name, place in sorted(replicator.peer_positions().items())
-            if name not in self.remote_actors and kinds[name] in ("robot", "human")
+            for name, place in sorted(self.replicator.peer_positions().items())
+            if name not in self.remote_actors and hellos[name].kind in BODY_KINDS
         }
 
     def control(self) -> None:

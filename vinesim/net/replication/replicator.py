@@ -148,6 +148,10 @@ class Replicator:
         """Hellos of all peers that are in this world now, by name."""
         return {name: peer.hello for name, peer in self._state.peers.known.items()}
 
+    def is_peer(self, name: str) -> bool:
+        """Whether an actor is a peer in this world now."""
+        return name in self._state.peers.known
+
     def peer_positions(self) -> dict[str, np.ndarray]:
         """Returns the last known positions [3] m of all peers, including spectators and far ones, by name."""
         return self._state.peers.positions()
