@@ -408,7 +408,7 @@ SETTLING = 4.0
 """Time before the measured time [s]: until each actor knows its neighbours."""
 
 
-def walking_actors(count: int, seconds: float = 2.0, seed: int = 1) -> dict[str, float]:
+def walking_actors(count: int, seconds: float, seed: int = 1) -> dict[str, float]:
     """Let ``count`` actors walk, half of them robots and half people, spread evenly over the ground, and return what
     one of them receives and what a router delivers in ``seconds``, after each knows its neighbours."""
     rng = np.random.default_rng(seed)
@@ -461,9 +461,10 @@ _UNITS = ("kB/s", "kB/s", "kB/s", "1/s", "kB/s", "cores", "", "s")
 def many_actors(
     clients: int, apart: float, seconds: float, processes: int, factor: float | None, limit: float, simulated: list[int]
 ) -> Iterator[Measurement]:
-    """Measure ``simulated`` numbers of actors without physics, then ``clients`` whole clients (0: none)."""
+    """Measure ``simulated`` numbers of actors without physics, then ``clients`` whole clients (0: none), each for
+    ``seconds`` of simulated time."""
     for count in simulated:
-        for (what, value), unit in zip(walking_actors(count).items(), _UNITS, strict=True):
+        for (what, value), unit in zip(walking_actors(count, seconds).items(), _UNITS, strict=True):
             yield Measurement("many_actors", f"{count} actors on 1 km2, without physics: {what}", value, unit)
     if clients:
         yield from whole_clients(clients, apart, seconds, processes, factor, limit)
