@@ -311,11 +311,14 @@ class Observer:
         self._positions = frames.pose([*place, 1.6])
         region = interest.region_chunks(interest.cell_of(np.array(place), interest.REGION_SIZE))
         self._pose = bus.publisher(interest.POSE_LAYERS[0].key.format(region=region, actor=bus.name))
+        self._far = bus.publisher(interest.FAR_KEY.format(actor=bus.name))
+        self._count = 0
+        """Number of positions that were published."""
         self._network_clock = NetworkClock(bus, now, time.time() - now)
         self._due = -math.inf
 
     def step(self, now: float) -> None:
-        """Publish this observer's position five times a second, for the actors around it."""
+        """Publish this observer's position: five times a second for the actors around it, and rarely for all others."""
         self._network_clock.advance(now)
         self._network_clock.ping_if_due()
         for key, payload, age in self.bus.replies():
@@ -327,3 +330,6 @@ class Observer:
                 self.bus.name, self._network_clock.time, self._positions, np.zeros(6), np.zeros(0), np.zeros(0)
             )
             self._pose.put(encode_robot(update))
+            if self._count % (interest.FAR_EVERY // interest.POSE_LAYERS[0].every) == 0:
+                self._far.put(encode_robot(update))
+            self._count += 1

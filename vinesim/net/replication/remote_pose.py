@@ -82,10 +82,10 @@ class RemotePose:
         return True
 
     def put(self, update: RobotUpdate | HumanUpdate, time: float) -> bool:
-        """Store only the position in a pose of the peer that arrived at network ``time`` [s]. Returns whether the pose
-        is newer than the last one."""
+        """Store only the position in a pose of the peer that arrived at network ``time`` [s]. Returns False if the pose
+        is older than the last one."""
         stated = min(update.time, time + dead_reckoning.MAX_CLOCK_SKEW)
-        if stated <= self.placed_at:
+        if stated < self.placed_at:
             return False
         self.place = update.base_q[:3]
         self.placed_at = stated
