@@ -321,7 +321,7 @@ def whole_clients(
 ) -> Iterator[Measurement]:
     """Measure ``count`` whole clients in rows ``apart`` [m], over three linked routers.
 
-    ``seconds``: measured simulated time. ``processes``: number of processes that share the clients. ``factor``:
+    ``seconds``: measured simulated time, in steps that each client has made. ``processes``: number of processes that share the clients. ``factor``:
     real-time factor of the world; None: as fast as all clients can follow. ``limit``: real time [s] after which the
     benchmark gives up.
     """
@@ -358,31 +358,29 @@ def whole_clients(
         met = time.monotonic() - start
         before = _ask(crowd, "work"), [cpu(process) for _, process in ends], time.monotonic()
         after = _ask(crowd)
-        begun = [one["world"] for one in before[0]]
-        while min(b["world"] - a for a, b in zip(begun, after, strict=True)) < seconds:
+        begun = np.array([one["time"] for one in _clients(before[0])])
+        while (spans := np.array([one["time"] for one in _clients(after)]) - begun).min() < seconds:
+            if time.monotonic() > end:
+                raise RuntimeError(f"{count} clients: not {seconds:g} s simulated after {limit:g} s")
             time.sleep(POLL)
             after = _ask(crowd)
         router_time = sum(cpu(process) for _, process in ends) - sum(before[1])
         wall = time.monotonic() - before[2]
-        spans = [b["world"] - a["world"] for a, b in zip(before[0], after, strict=True)]
-        rates = [
-            (b["bytes_in"] - a["bytes_in"]) / span
-            for one, other, span in zip(before[0], after, spans, strict=True)
-            for a, b in zip(one["clients"], other["clients"], strict=True)
-        ]
+        received = [b["bytes_in"] - a["bytes_in"] for a, b in zip(_clients(before[0]), _clients(after), strict=True)]
+        rates = np.array(received) / spans
         at_rest = until(
             lambda reports: (found := _are_equal(reports))[0] == found[1] >= count and found[2], "equal records"
         )
         objects, equal, _ = _are_equal(_clients(at_rest))
         reports = _clients(at_rest)
     case = f"{count} whole clients {apart:g} m apart, {ROUTERS} linked routers"
-    simulated = float(np.mean(spans))
+    simulated = float(spans.mean())
     rows = (
         ("clients that know all others and where they are", sum(one["known"] == count - 1 for one in reports), ""),
         ("real time until all knew each other", met, "s"),
         ("bodies of others on a client, most", max(one["bodies"] for one in reports), ""),
-        ("received by the client that receives most, per simulated second", max(rates) / 1e3, "kB/s"),
-        ("received by a client, mean, per simulated second", float(np.mean(rates)) / 1e3, "kB/s"),
+        ("received by the client that receives most, per simulated second", float(rates.max()) / 1e3, "kB/s"),
+        ("received by a client, mean, per simulated second", float(rates.mean()) / 1e3, "kB/s"),
         ("routers' CPU, per simulated second", router_time / simulated, "s"),
         ("real-time factor", simulated / wall, ""),
         ("objects with a record", objects, "objects"),
