@@ -321,9 +321,9 @@ def whole_clients(
 ) -> Iterator[Measurement]:
     """Measure ``count`` whole clients in rows ``apart`` [m], over three linked routers.
 
-    ``seconds``: measured simulated time, in steps that each client has made. ``processes``: number of processes that share the clients. ``factor``:
-    real-time factor of the world; None: as fast as all clients can follow. ``limit``: real time [s] after which the
-    benchmark gives up.
+    ``seconds``: measured simulated time, in steps that each client has made. ``processes``: number of processes that
+    share the clients. ``factor``: real-time factor of the world; None: as fast as all clients can follow. ``limit``:
+    real time [s] after which the benchmark gives up.
     """
     options = () if factor is None else ("--real-time-factor", f"{factor:g}")
     with contextlib.ExitStack() as stack:
