@@ -418,7 +418,7 @@ class PeerRegistry:
         assert self.region is not None
         places = np.array([actor.place[:2] for actor in self.known.values() if actor.place is not None]).reshape(-1, 2)
         offset = np.abs(interest.cells_of(places, interest.REGION_SIZE) - np.array(self.region))
-        around = np.count_nonzero((offset <= 1).all(axis=1))
+        around = int(np.count_nonzero((offset <= 1).all(axis=1)))
         layer_rate = interest.POSE_RATE / interest.POSE_LAYERS[0].every
         self._thinning = interest.thinning(around, layer_rate, interest.REGION_BUDGET)
         far_rate = interest.POSE_RATE / interest.FAR_EVERY
