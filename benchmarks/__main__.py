@@ -89,6 +89,35 @@ def _file_fuzz(files: int, seed: int, first: int, kinds: str) -> Iterator[Measur
     return _call("file_fuzz:file_fuzz")(files, seed, first, kinds, announce)
 
 
+def _many_actors(
+    clients: int,
+    apart: float,
+    seconds: float,
+    processes: int,
+    real_time_factor: float | None,
+    limit: float,
+    simulated: str,
+) -> Iterator[Measurement]:
+    for option, value, least in (
+        ("clients", clients, 0),
+        ("apart", apart, 1.0),
+        ("seconds", seconds, 0.1),
+        ("processes", processes, 1),
+        ("limit", limit, 1.0),
+    ):
+        if value < least:
+            raise UsageError(f"--{option} is {value:g}: give {least:g} or more")
+    if real_time_factor is not None and not 0.01 <= real_time_factor <= 1.0:
+        raise UsageError(f"--real-time-factor is {real_time_factor:g}: give 0.01 to 1")
+    try:
+        counts = [int(word) for word in simulated.split(",") if word]
+    except ValueError:
+        raise UsageError(f"--simulated is {simulated!r}: give numbers with commas between them") from None
+    if any(count < 2 for count in counts):
+        raise UsageError(f"--simulated is {simulated!r}: give numbers of 2 or more")
+    return _call("many_actors:many_actors")(clients, apart, seconds, processes, real_time_factor, limit, counts)
+
+
 def _soak(minutes: float, real_time_factor: float | None) -> Iterator[Measurement]:
     if minutes <= 0.0:
         raise UsageError(f"--minutes is {minutes:g}: give more than 0")
@@ -173,6 +202,26 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
     "traffic": (_later("traffic:traffic"), "bytes that a client of a full vineyard receives and sends", {}),
     "load": (_later("router_load:load"), "many clients on one router, and on two linked routers", {}),
     "actors": (_later("many_actors:actors"), "64 robots and people with bodies: are all clients equal at the end?", {}),
+    "many_actors": (
+        _many_actors,
+        "hundreds of whole clients over three linked routers, and a thousand actors without physics",
+        {
+            "clients": {"type": int, "default": 300, "help": "number of whole clients; 0: none"},
+            "apart": {"type": float, "default": 8.0, "help": "distance of neighbours [m]"},
+            "seconds": {"type": float, "default": 2.0, "help": "measured simulated time [s]"},
+            "processes": {
+                "type": int,
+                "default": os.cpu_count() or 1,
+                "help": "number of processes that share the clients (default: one a core)",
+            },
+            "real-time-factor": {
+                "type": float,
+                "help": "rate of the world's time (default: as fast as all clients can follow)",
+            },
+            "limit": {"type": float, "default": 3600.0, "help": "real time after which it gives up [s]"},
+            "simulated": {"default": "30,100,300,1000", "help": "numbers of actors without physics; empty: none"},
+        },
+    ),
     "link": (_later("touch_latency:link"), "real clients over emulated links; needs root", {}),
     "sound": (_later("sound_delay:sound"), "delay of alarms and voices between two clients, in simulated time", {}),
     "page": (_later("page_latency:page"), "delay from an input of a person to the state that shows it", {}),

@@ -1,10 +1,16 @@
 """``python -m benchmarks actors``: 64 robots and people with bodies in one world, compared on all clients at the end.
+``python -m benchmarks many_actors``: hundreds of whole clients over linked routers, and a thousand actors on a plain.
 
-Every client has the whole physics, some of the actors, and a copy of every other actor. All actors stand within the
-distance in which they receive each other, in rows 1.2 m apart, each with a bunch above it and a box before it. Each
-actor picks its bunch, which falls to the ground, and pushes its box: robots with their base, people with their shins.
-When everything is at rest, the retained objects and their owners are compared between all clients. The bus is in memory
-and the clock simulated: the figures do not depend on the machine.
+**actors.** Every client has the whole physics, some of the actors, and a copy of every other actor. All actors stand
+within the distance in which they receive each other, in rows 1.2 m apart, each with a bunch above it and a box before
+it. Each actor picks its bunch, which falls to the ground, and pushes its box: robots with their base, people with their
+shins. When everything is at rest, the retained objects and their owners are compared between all clients. The bus is in
+memory and the clock simulated: the figures do not depend on the machine.
+
+**many_actors.** Whole clients without renderers, each with a session of its own on one of three linked routers. Each
+actor picks its bunch and pushes its box; at the end all clients have equal records. The world passes as fast as the
+machine can step all clients. Besides, 30 to 1,000 actors without physics walk on a square kilometre, with the
+replication and the codecs of a client and a network in memory that counts what a router would deliver.
 """
 
 from __future__ import annotations
@@ -15,21 +21,33 @@ import functools
 import math
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
+from benchmarks.router_load import cpu, router
+from benchmarks.support.crowd_clients import (
+    HEIGHT,
+    PUSH,
+    PUSH_TIME,
+    CrowdProcess,
+    is_person,
+    place_of,
+    yard,
+)
+from benchmarks.support.fake_client import FakeClient, tree_row
+from benchmarks.support.indexed_hub import IndexedHub
 from vinesim.client.client import Client, label_index
 from vinesim.core import frames
-from vinesim.net.codec.control import decode_records, encode_records
+from vinesim.net.codec.control import decode_records, decode_time, encode_records, encode_time
+from vinesim.net.replication import interest
 from vinesim.net.replication.retained import RetainedState
 from vinesim.net.transport.bus import KEEP_ALL
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.rigid.human_posture import standing_pose
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
-from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import ObjectKind, object_id
-from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import HumanPose, HumanSpec, Measurement
 
@@ -40,13 +58,7 @@ DELAY = 0.02
 JITTER = 0.004
 LOSS = 0.01
 """Network delay one way [s], jitter [s], and share of messages that is lost."""
-PUSH = 0.15
-"""Distance by which each actor pushes its box [m]."""
-PUSH_TIME = 1.0
-"""Duration of a push [s]."""
 DT = 0.01
-HEIGHT = 1.75
-"""Height of people [m]."""
 CLIENTS = 2
 """Number of clients of the command. Each simulates half of the actors, and has copies of the others."""
 MEETING_LIMIT = 10.0
@@ -76,29 +88,6 @@ class Agreement:
     """Numbers of faults of all clients together, by name."""
 
 
-def _place(number: int, count: int) -> np.ndarray:
-    """Returns the position [2] m of the actor ``number`` among ``count`` actors."""
-    row = math.ceil(math.sqrt(count))
-    return APART * np.array([number % row, number // row], float)
-
-
-def yard(count: int) -> Model:
-    """Returns a model with a short cane and its bunch 0.35 m from each of ``count`` places, and a box before each
-    place."""
-    trees = []
-    boxes = []
-    for number in range(count):
-        x, y = _place(number, count)
-        tree = TreeBuilder(frames.pose(np.array([x - 0.2, y + 0.6, 1.6])))
-        tip = tree.add_rod(-1, 0.3, (0.006, 0.004), RodMaterial(2e9, 900.0), 3)[-1]
-        tree.add_bunch(tip, 0.4, clusters=False)
-        trees.append(tree)
-        boxes.append(frames.pose([x + 0.55, y, 0.001]))
-    return assemble(
-        trees, box_pose=np.array(boxes), box_size=np.tile([0.2, 0.3, 0.2], (count, 1)), box_mass=np.full(count, 1.0)
-    )
-
-
 class Crowd:
     """Clients on one bus in memory, with a server of retained records. Every second actor is a person."""
 
@@ -107,7 +96,7 @@ class Crowd:
         own."""
         self.count = count
         self.now = 100.0
-        self.model = yard(count)
+        self.model = yard(count, APART)
         self.hub = MemoryHub(delay=DELAY, jitter=JITTER, loss=LOSS, seed=1)
         self._records = RetainedState()
         self._server = self.hub.bus("server")
@@ -119,8 +108,8 @@ class Crowd:
         self._pushing_since = math.inf
         self.clients: list[Client] = []
         for number in range(count):
-            x, y = _place(number, count)
-            person = number % 2 == 1
+            x, y = place_of(number, count, APART)
+            person = is_person(number)
             name = f"{'person' if person else 'robot'}{number}"
             pose = frames.pose([x, y, 0.0])
             source = self._walk(x, y)
@@ -293,3 +282,187 @@ def actors(count: int = ACTORS) -> Iterator[Measurement]:
             yield Measurement("actors", f"{case}: {what}", float(value), unit)
         else:
             yield Measurement("actors", f"{case}: {what}", float(value), unit, "wanted", float(wanted))
+
+
+# ---------------------------------------------------------------- whole clients over linked routers
+
+ROUTERS = 3
+"""Number of linked servers; the first keeps the world, the others only route."""
+WORKING_LIMIT = 20.0
+"""Limit of simulated time [s] until everything is at rest by equal records."""
+POLL = 1.0
+"""Real time between two reports of all clients [s]."""
+
+
+def _ask(processes: list[CrowdProcess], do: str = "report") -> list[dict[str, Any]]:
+    """Send a command to all processes, and return their answers."""
+    for process in processes:
+        process.send(do)
+    return [process.answer() for process in processes]
+
+
+def _clients(answers: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return sorted((one for answer in answers for one in answer["clients"]), key=lambda one: one["number"])
+
+
+def _are_equal(reports: list[dict[str, Any]]) -> tuple[int, int, bool]:
+    """Returns the number of objects with a record, the number of those whose records are at rest and equal on all
+    clients that have one, and whether nothing has an owner any more."""
+    found: dict[str, set[tuple[str, bool]]] = {}
+    for report in reports:
+        for name, record in report["records"].items():
+            found.setdefault(name, set()).add(tuple(record))
+    equal = sum(len(records) == 1 and not next(iter(records))[1] for records in found.values())
+    return len(found), equal, not any(report["owned"] for report in reports)
+
+
+def whole_clients(
+    count: int, apart: float, seconds: float, processes: int, factor: float | None, limit: float
+) -> Iterator[Measurement]:
+    """Measure ``count`` whole clients in rows ``apart`` [m], over three linked routers.
+
+    ``seconds``: measured simulated time, in steps that each client has made. ``processes``: number of processes that
+    share the clients. ``factor``: real-time factor of the world; None: as fast as all clients can follow. ``limit``:
+    real time [s] after which the benchmark gives up.
+    """
+    options = () if factor is None else ("--real-time-factor", f"{factor:g}")
+    with contextlib.ExitStack() as stack:
+        ends = [stack.enter_context(router(*options))]
+        for _ in range(ROUTERS - 1):
+            ends.append(stack.enter_context(router("--connect", ends[-1][0])))
+        groups = [list(range(first, count, processes)) for first in range(min(processes, count))]
+        crowd = [
+            stack.enter_context(CrowdProcess(ends[i % ROUTERS][0], group, count, apart))
+            for i, group in enumerate(groups)
+        ]
+        end = time.monotonic() + limit
+        places = np.array([place_of(number, count, apart) for number in range(count)])
+        away = np.linalg.norm(places[:, None] - places[None], axis=-1)
+        wanted = np.minimum((away < interest.BODY_DISTANCE - 1.0).sum(1) - 1, interest.MAX_BODIES)
+
+        def until(condition: Callable[[list[dict[str, Any]]], bool], what: str) -> list[dict[str, Any]]:
+            while not condition(_clients(answers := _ask(crowd))):
+                if time.monotonic() > end:
+                    raise RuntimeError(f"{count} clients: {what} not after {limit:g} s")
+                time.sleep(POLL)
+            return answers
+
+        start = time.monotonic()
+        until(
+            lambda reports: all(
+                one["known"] == count - 1 and one["placed"] == count - 1 and one["bodies"] >= enough
+                for one, enough in zip(reports, wanted.tolist(), strict=True)
+            ),
+            "all know each other",
+        )
+        met = time.monotonic() - start
+        before = _ask(crowd, "work"), [cpu(process) for _, process in ends], time.monotonic()
+        after = _ask(crowd)
+        begun = np.array([one["time"] for one in _clients(before[0])])
+        while (spans := np.array([one["time"] for one in _clients(after)]) - begun).min() < seconds:
+            if time.monotonic() > end:
+                raise RuntimeError(f"{count} clients: not {seconds:g} s simulated after {limit:g} s")
+            time.sleep(POLL)
+            after = _ask(crowd)
+        router_time = sum(cpu(process) for _, process in ends) - sum(before[1])
+        wall = time.monotonic() - before[2]
+        received = [b["bytes_in"] - a["bytes_in"] for a, b in zip(_clients(before[0]), _clients(after), strict=True)]
+        rates = np.array(received) / spans
+        at_rest = until(
+            lambda reports: (found := _are_equal(reports))[0] == found[1] >= count and found[2], "equal records"
+        )
+        objects, equal, _ = _are_equal(_clients(at_rest))
+        reports = _clients(at_rest)
+    case = f"{count} whole clients {apart:g} m apart, {ROUTERS} linked routers"
+    simulated = float(spans.mean())
+    rows = (
+        ("clients that know all others and where they are", sum(one["known"] == count - 1 for one in reports), ""),
+        ("real time until all knew each other", met, "s"),
+        ("bodies of others on a client, most", max(one["bodies"] for one in reports), ""),
+        ("received by the client that receives most, per simulated second", float(rates.max()) / 1e3, "kB/s"),
+        ("received by a client, mean, per simulated second", float(rates.mean()) / 1e3, "kB/s"),
+        ("routers' CPU, per simulated second", router_time / simulated, "s"),
+        ("real-time factor", simulated / wall, ""),
+        ("objects with a record", objects, "objects"),
+        ("of these at rest by the same record on all clients that have one", equal, "objects"),
+        ("faults of all clients", sum(sum(one["faults"].values()) for one in reports), "faults"),
+    )
+    for what, value, unit in rows:
+        yield Measurement("many_actors", f"{case}: {what}", float(value), unit)
+
+
+# ---------------------------------------------------------------- a thousand actors without physics
+
+SIDE = 1000.0
+"""Edge length of the ground on which the actors walk [m]."""
+WALK = 1.0
+"""Speed of the actors [m/s]."""
+DELIVERY = 8e-6
+"""Processor time of a router for a delivered pose [s], as ``python -m benchmarks load`` measured with 100 clients on 16
+cores."""
+COARSE_TICK = 0.25
+"""Time step before the measured time [s]."""
+SETTLING = 4.0
+"""Time before the measured time [s]: until each actor knows its neighbours."""
+
+
+def walking_actors(count: int, seconds: float, seed: int = 1) -> dict[str, float]:
+    """Let ``count`` actors walk, half of them robots and half people, spread evenly over the ground, and return what
+    one of them receives and what a router delivers in ``seconds``, after each knows its neighbours."""
+    rng = np.random.default_rng(seed)
+    hub = IndexedHub()
+    now = 0.0
+    hub.answers["clock"] = lambda _, asked: encode_time(decode_time(asked).asked, now)
+    hub.answers["snap"] = lambda *_: encode_records([])
+    model = tree_row(1)
+    actors = [
+        FakeClient(hub.bus(f"a{number}"), model, tuple(place), kind="human" if is_person(number) else "robot")
+        for number, place in enumerate(rng.uniform(0.0, SIDE, (count, 2)))
+    ]
+    heading = rng.uniform(0.0, 2.0 * np.pi, count)
+    steps = WALK * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+
+    def tick(dt: float) -> None:
+        nonlocal now
+        now += dt
+        for actor, step in zip(actors, steps, strict=True):
+            actor.place[:2] = np.abs(actor.place[:2] + dt * step)
+            actor.tick(now)
+
+    def received() -> np.ndarray:
+        """Returns the bytes that each actor has received: all, and those of hellos, the clock and snapshots."""
+        return np.array([(actor.bus.bytes_in, actor.replicator.counters.control.bytes_in) for actor in actors], float)
+
+    start = time.process_time()
+    for _ in range(round(SETTLING / COARSE_TICK)):
+        tick(COARSE_TICK)
+    before = received(), hub.deliveries, hub.delivered_bytes
+    for _ in range(round(60.0 * seconds)):
+        tick(1.0 / 60.0)
+    all_bytes, control = ((received() - before[0]) / seconds / 1e3).T
+    deliveries = (hub.deliveries - before[1]) / seconds
+    return {
+        "received by an actor, mean": float((all_bytes - control).mean()),
+        "received by the actor that receives most": float((all_bytes - control).max()),
+        "besides, hellos and the clock while it gets to know the others, most": float(control.max()),
+        "delivered by a router": deliveries,
+        "delivered by a router, bytes": (hub.delivered_bytes - before[2]) / seconds / 1e3,
+        "a router's CPU at 8 us a delivery": DELIVERY * deliveries,
+        "near actors, most": float(max(len(actor.replicator.near_positions()) for actor in actors)),
+        "processor time of the simulation": time.process_time() - start,
+    }
+
+
+_UNITS = ("kB/s", "kB/s", "kB/s", "1/s", "kB/s", "cores", "", "s")
+
+
+def many_actors(
+    clients: int, apart: float, seconds: float, processes: int, factor: float | None, limit: float, simulated: list[int]
+) -> Iterator[Measurement]:
+    """Measure ``simulated`` numbers of actors without physics, then ``clients`` whole clients (0: none), each for
+    ``seconds`` of simulated time."""
+    for count in simulated:
+        for (what, value), unit in zip(walking_actors(count, seconds).items(), _UNITS, strict=True):
+            yield Measurement("many_actors", f"{count} actors on 1 km2, without physics: {what}", value, unit)
+    if clients:
+        yield from whole_clients(clients, apart, seconds, processes, factor, limit)

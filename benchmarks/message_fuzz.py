@@ -33,6 +33,7 @@ from vinesim.net.codec.control import (
     Welcome,
     decode_time,
     encode_claims,
+    encode_description,
     encode_hello,
     encode_records,
     encode_time,
@@ -259,7 +260,7 @@ def key_of(family: str, name: str, cells: list[interest.Cell], chance: random.Ra
         )
         return chance.choice(odd)
     if family == "a":
-        return chance.choice((f"a/{name}", f"a/{name}/far"))
+        return chance.choice((f"a/{name}", f"a/{name}/far", f"pose/0/0/{name}"))
     if family == "voice":
         return chance.choice((f"voice/{name}", f"voice/{name}", f"voice/{name}/pcm"))
     return f"force/ada/{name}" if family == "force" else f"{family}/{x}/{y}/{name}"
@@ -439,7 +440,7 @@ def attack(count: int, seed: int = 0, *, kind: str = "robot", is_stranger: bool 
             if step % 10 == 0:
                 world.admission.decide(WORLD, ATTACKER, "another", bad, world.now)
             if step % 100 == 50:
-                world.greet(bad)
+                world.greet(bad, corrupt(encode_description(world.hello(kind)), payload, chance))
             elif step % 100 == 99:
                 world.admit(kind)
             begin = time.thread_time()

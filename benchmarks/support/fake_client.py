@@ -78,10 +78,12 @@ class FakeClient:
         digest: str = "fake_clients",
         near: float = interest.INTEREST_RADIUS,
         restless: bool = True,
+        hello: Hello | None = None,
     ) -> None:
-        """Join at ``place`` [2] m. ``restless``: the joints swing, so that no two poses are equal."""
+        """Join at ``place`` [2] m. ``restless``: the joints swing, so that no two poses are equal. ``hello``: of a
+        robot with ``joints``; None: one without a URDF."""
         joints = 0 if kind == "human" else joints
-        hello = Hello(bus.name, kind=kind, scene="fake_clients", digest=digest, joints=joints)
+        hello = hello or Hello(bus.name, kind=kind, scene="fake_clients", digest=digest, joints=joints)
         self.bus = bus
         self.model = model
         self.name = bus.name

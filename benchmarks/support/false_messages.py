@@ -23,6 +23,7 @@ from vinesim.net.codec.control import (
     Welcome,
     decode_records,
     encode_claims,
+    encode_description,
     encode_hello,
     encode_records,
     encode_time,
@@ -57,13 +58,15 @@ class FalseMessage:
     """``put``, ``greet``, ``mesh`` or ``join``."""
     payload: bytes
     key: str = ""
+    description: bytes = b""
+    """Description of the robot of a greeting."""
 
     def tell(self, world: FuzzWorld) -> None:
         """Send the message into a ``world``."""
         if self.kind == "put":
             world.put(self.key, shift_time(self.payload, world.now))
         elif self.kind == "greet":
-            world.greet(self.payload)
+            world.greet(self.payload, self.description)
         elif self.kind == "join":
             world.admission.decide(WORLD, ATTACKER, "another", self.payload, world.now)
         else:
@@ -323,7 +326,8 @@ def _records(draw: Draw, model: Model) -> FalseMessage:
 
 
 def _pose_key(draw: Draw) -> str:
-    return f"a/{ATTACKER}" + draw(st.sampled_from(("", "/far", "/mid", "/near")))
+    places = ("a/{}", "a/{}/far", "a/{}/mid", "a/{}/near", "pose/0/0/{}", "pose/-1/-1/{}")
+    return draw(st.sampled_from(places)).format(ATTACKER)
 
 
 def _robot_pose(draw: Draw, _: Model) -> FalseMessage:
@@ -426,7 +430,8 @@ def _greeting(draw: Draw, model: Model) -> FalseMessage:
         height=draw(st.sampled_from((1.0, 1.75, 2.5))),
         outfit=draw(st.sampled_from(("", "green", "no-such-outfit"))),
     )
-    return FalseMessage(draw(st.sampled_from(("greet", "greet", "join"))), encode_hello(hello))
+    kind = draw(st.sampled_from(("greet", "greet", "join")))
+    return FalseMessage(kind, encode_hello(hello), description=encode_description(hello))
 
 
 def _mesh(draw: Draw, _: Model) -> FalseMessage:

@@ -22,11 +22,20 @@ from benchmarks.support.fake_client import FakeClient
 from benchmarks.support.sound_recorder import SoundRecorder
 from vinesim.client.client import Client
 from vinesim.core import frames
-from vinesim.net.codec.control import Hello, RetainedRecord, decode_records, decode_time, encode_hello, encode_time
+from vinesim.net.codec.control import (
+    Hello,
+    RetainedRecord,
+    decode_records,
+    decode_time,
+    encode_description,
+    encode_hello,
+    encode_time,
+)
 from vinesim.net.codec.header import MAX_COORDINATE, MessageError
 from vinesim.net.codec.human import encode_pose
 from vinesim.net.codec.meshes import MESH_PART, MESH_REQUEST, decode_part, decode_request, encode_part, encode_wanted
 from vinesim.net.codec.objects import check_object_id
+from vinesim.net.replication import interest
 from vinesim.net.replication.receiver import check_record
 from vinesim.net.replication.streams import object_counts
 from vinesim.net.server.admission import AdmissionControl, SceneId
@@ -114,6 +123,7 @@ class FuzzWorld:
         )
         self.publishers: dict[str, Publisher] = {}
         self.greeting = b""
+        self.description = b""
         self.threads = {thread for thread in threading.enumerate() if thread.is_alive()}
         self.bus = self.hub.bus(ATTACKER, live=False)
         self.run(0.5)
@@ -147,16 +157,19 @@ class FuzzWorld:
         )
         return msgspec.structs.replace(hello, **values)
 
-    def greet(self, hello: Hello | bytes) -> None:
-        """Leave the world as the attacker, and come back with this greeting."""
+    def greet(self, hello: Hello | bytes, description: bytes = b"") -> None:
+        """Leave the world as the attacker, and come back with this greeting. ``description``: of its robot, if
+        ``hello`` is bytes."""
         if self.is_stranger:
             return
         self.greeting = hello if isinstance(hello, bytes) else encode_hello(hello)
+        self.description = description if isinstance(hello, bytes) else encode_description(hello)
         self.admission.decide(WORLD, ATTACKER, "session", self.greeting, self.now)
         self.bus.close()
         self.step()
         self.bus = self.hub.bus(ATTACKER)
         self.bus.declare_queryable(f"hello/{ATTACKER}", lambda _: self.greeting)
+        self.bus.declare_queryable(f"robot/{ATTACKER}", lambda _: self.description)
         self.publishers.clear()
 
     def admit(self, kind: str) -> None:
@@ -169,7 +182,9 @@ class FuzzWorld:
         for _ in range(100):  # a client asks the server about a name twice a second
             if ATTACKER in self.client.remote_actors:
                 break
-            self.put(f"a/{ATTACKER}/far", encode_pose(self.pose(self.now)))
+            pose = self.pose(self.now)
+            region = interest.region_chunks(interest.cell_of(pose.base_q, interest.REGION_SIZE))
+            self.put(interest.POSE_LAYERS[0].key.format(region=region, actor=ATTACKER), encode_pose(pose))
             self.step()
         if ATTACKER not in self.client.remote_actors and kind != "spectator":
             raise LawBroken("an actor that greets and poses as it should gets no body")

@@ -6,6 +6,7 @@ import pytest
 from vinesim.client.tasks.free_places import TAKEN, choose_places
 from vinesim.client.tasks.start_poses import BASE_CLEARANCE, ground_clearance, start_pose
 from vinesim.net.codec.human import encode_pose
+from vinesim.net.replication import interest
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.rigid.human_posture import standing_pose
 from vinesim.scene.generation.vineyard import generate
@@ -35,7 +36,9 @@ class World:
 
     def stand(self, bus, pose, update=None):
         update = update or RobotUpdate(bus.name, 0.0, pose, np.zeros(6), np.zeros(2), np.zeros(2))
-        self.actors[bus.name] = bus.publisher(f"a/{bus.name}/far"), encode_pose(update)
+        region = interest.region_chunks(interest.cell_of(update.base_q, interest.REGION_SIZE))
+        key = interest.POSE_LAYERS[0].key.format(region=region, actor=bus.name)
+        self.actors[bus.name] = bus.publisher(key), encode_pose(update)
 
     def wait(self, seconds):
         for publisher, payload in self.actors.values():

@@ -78,7 +78,7 @@ def test_all_messages_are_recorded(tmp_path):
     world.run(0.5)
     recorded = world.recorded()
     assert recorded.damage == ""
-    assert families(recorded) == {"a", "tree", "near", "own", "hello", "live", "snap"}
+    assert families(recorded) == {"a", "pose", "tree", "near", "own", "hello", "live", "snap"}
     about = {
         "scene": "rows",
         "seed": "5",
@@ -157,8 +157,16 @@ def test_an_observer_records_an_actor_that_is_alone(tmp_path):
     world.run(2.0)
     world.touch()
     recorded = world.recorded()
-    assert families(recorded) == {"a", "tree", "own", "hello", "live", "snap"}  # nothing is within 3 m of the tree
-    assert sum(entry.key.startswith("a/ada") for entry in recorded.messages) > 150
+    assert families(recorded) == {
+        "a",
+        "pose",
+        "tree",
+        "own",
+        "hello",
+        "live",
+        "snap",
+    }  # nothing is within 3 m of the tree
+    assert sum(entry.key.partition("/")[0] in ("a", "pose") for entry in recorded.messages) > 150
     assert sum(entry.key == "tree/0/0/ada" for entry in recorded.messages) > 50
     assert not any("recorder" in entry.key for entry in recorded.messages)
 
@@ -181,7 +189,7 @@ def test_only_selected_families_are_recorded(tmp_path, only):
     world.run(0.5)
     world.touch()
     expected = {
-        "poses": {"a"},
+        "poses": {"a", "pose"},
         "trees": {"tree", "near"},
         "things": set(),
         "events": {"own"},

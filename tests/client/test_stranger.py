@@ -15,7 +15,15 @@ from vinesim.client.remote import stranger
 from vinesim.client.remote.spawner import RemoteSpawner
 from vinesim.client.remote.stranger import StrangerLoader
 from vinesim.core import frames
-from vinesim.net.codec.control import Hello, decode_hello, encode_hello, pack
+from vinesim.net.codec.control import (
+    DESCRIPTION,
+    Hello,
+    decode_description,
+    decode_hello,
+    description_digest,
+    encode_hello,
+    pack,
+)
 from vinesim.net.codec.header import MessageError
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.description.urdf import DescriptionError
@@ -79,6 +87,9 @@ def test_a_greeting_with_too_large_a_robot_is_refused_unparsed(urdf, what):
     assert what in urdf_objection(urdf)
     with pytest.raises(MessageError, match="URDF"):
         decode_hello(pack(HELLO, Hello("guest", urdf=urdf)))
+    payload = pack(DESCRIPTION, (urdf, ""))
+    with pytest.raises(MessageError, match="URDF"):
+        decode_description(payload, description_digest(payload))
     with pytest.raises(MessageError, match="URDF"):
         encode_hello(Hello("guest", urdf=urdf))
 

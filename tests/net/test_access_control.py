@@ -24,7 +24,7 @@ from vinesim.net.codec.control import (
     encode_time,
 )
 from vinesim.net.codec.meshes import MeshPart, decode_part, decode_wanted, encode_part, encode_request
-from vinesim.net.replication.interest import POSE_LAYERS
+from vinesim.net.replication.interest import FAR_KEY, POSE_LAYERS
 from vinesim.net.server.admission import SceneId
 from vinesim.net.server.server import Server
 from vinesim.net.transport import zenoh_bus, zenoh_session
@@ -77,6 +77,7 @@ WRITTEN = [
     "a/{}/far",
     "a/{}/mid",
     "a/{}/near",
+    "pose/0/-1/{}",
     "c/0/-1/{}",
     "tree/0/-1/{}",
     "near/0/-1/{}",
@@ -133,7 +134,8 @@ def test_an_actor_writes_under_its_own_name_and_no_other(server, certs):
 
 def test_a_spectator_writes_its_pose_and_its_voice_and_nothing_else(server, certs):
     keys = [f"vs/1/vineyard/{key.format(name)}" for key in WRITTEN for name in ("guest", "ada")]
-    own = [f"vs/1/vineyard/a/guest{layer.suffix}" for layer in POSE_LAYERS]
+    poses = [FAR_KEY, *(layer.key for layer in POSE_LAYERS)]
+    own = [f"vs/1/vineyard/{key.format(actor='guest', region='0/-1')}" for key in poses]
     own += [f"vs/1/vineyard/voice/guest{suffix}" for suffix in ("", "/pcm")]
     assert sorted(keys_received(certs, server, "guest", keys)) == sorted(own)
 

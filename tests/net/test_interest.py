@@ -68,7 +68,7 @@ def test_layers_of_poses_have_hysteresis():
     assert [interest.count_layers(d, 4) for d in (3.5, 3.7, 7.1, 7.3, 14.3, 14.5)] == [4, 3, 3, 2, 2, 1]
 
 
-@given(st.floats(0.05, 100.0))
+@given(st.floats(0.05, interest.BODY_DISTANCE))
 def test_the_rate_of_poses_falls_with_the_distance(distance):
     """Rate times distance is bounded both ways: what moves at 1 m/s moves by 1/180 to 1/90 rad between two poses."""
     received = interest.count_layers(distance, 1)

@@ -23,10 +23,13 @@ from vinesim.net.codec.control import (
     Hello,
     RetainedRecord,
     decode_claims,
+    decode_description,
     decode_hello,
     decode_records,
     decode_time,
+    description_digest,
     encode_claims,
+    encode_description,
     encode_hello,
     encode_records,
     encode_time,
@@ -265,7 +268,15 @@ def test_a_pose_that_is_not_finite_or_rotated_by_more_than_a_half_turn_is_refuse
 
 def test_a_hello_is_decoded_and_invalid_ones_are_refused():
     hello = Hello("robot-1.a", "robot", "tiago", "<robot/>", "tendone", "0123456789abcdef", index=3, joints=14)
-    assert decode_hello(encode_hello(hello)) == hello
+    description = encode_description(hello)
+    digest = description_digest(description)
+    sent = msgspec.structs.replace(hello, urdf="", sidecar="", robot_digest=digest)
+    assert decode_hello(encode_hello(hello)) == sent
+    assert decode_description(description, digest).complete(sent) == msgspec.structs.replace(hello, robot_digest=digest)
+    with pytest.raises(MessageError, match="announced"):
+        decode_description(description, description_digest(b"another"))
+    with pytest.raises(MessageError, match="with the digest 'no digest'"):
+        encode_hello(Hello("a", robot_digest="no digest"))
     for name in ("", "a/b", "a*", "ä", "x" * 49):
         with pytest.raises(MessageError, match="actor name"):
             encode_hello(Hello(name))
@@ -274,6 +285,12 @@ def test_a_hello_is_decoded_and_invalid_ones_are_refused():
         decode_hello(encode_hello(Hello("a", protocol=other)))
     with pytest.raises(MessageError, match="too long"):
         encode_hello(Hello("a", urdf="x" * MAX_MESSAGE))
+
+
+def test_a_greeting_has_the_same_size_for_a_robot_of_any_size():
+    sizes = {len(encode_hello(Hello("a", urdf="<robot>" + count * "<link/>" + "</robot>"))) for count in (1, 30)}
+    assert len(sizes) == 1
+    assert sizes.pop() < 150
 
 
 _NAN = float("nan")
@@ -331,6 +348,8 @@ def test_clock_messages_are_decoded():
 
 
 DECODERS = (
+    lambda payload: decode_description(payload, "0" * 40),
+    lambda payload: decode_description(payload, description_digest(payload)),
     lambda payload: decode_robot(payload, "a"),
     lambda payload: decode_trees(payload, np.array([3, 4])),
     decode_trees,
@@ -367,6 +386,7 @@ def test_damaged_messages_raise_only_message_errors(data):
         encode_objects(objects(rng, 3), (0, 0))[0][0],
         encode_records([record(), record(object=3)]),
         encode_hello(Hello("a", urdf="<robot/>")),
+        encode_description(Hello("a", urdf="<robot/>")),
         encode_claims([(1, Claim(1, 2, "a"), True)]),
         encode_time(1.0, 2.0),
     ]
@@ -590,4 +610,4 @@ def test_the_schemas_of_recordings_stay_as_they_are():
     """Their text is part of the file format."""
     keys = ("a/x", "c/0/0/x", "tree/0/0/x", "near/0/0/x", "own/0/0/x", "fact/0/0/x", "force/y/x", "snap/0/0", "hello/x")
     text = b"".join(name.encode() + schema for name, schema in map(schema_of, (*keys, "live/x", "other/x")))
-    assert hashlib.blake2b(text, digest_size=8).hexdigest() == "86147581532c9b54"
+    assert hashlib.blake2b(text, digest_size=8).hexdigest() == "335322279f6bbd5e"

@@ -25,6 +25,7 @@ from vinesim.scene.ids import ObjectKind, object_id
 KEYS = (
     "a/ada",
     "a/ada/far",
+    "pose/0/-1/ada",
     "c/0/-1/ada",
     "tree/0/-1/ada",
     "near/0/-1/ada",

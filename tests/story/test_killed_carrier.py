@@ -43,6 +43,33 @@ def load(world: World, ada: Client) -> None:
     assert supports[1] in ("ada/left", "ada/right")
 
 
+def test_what_a_robot_carries_does_not_fall_when_its_body_is_removed_because_it_is_far_away():
+    """On the client that went away, box and bunch stay where their records state, and are on the robot again later."""
+    world = World()
+    ada = world.join("ada", -1.0, -1.0)
+    bob = world.join("bob", 0.0, -2.0)
+    world.until(lambda: "ada" in bob.remote_actors, 1.0)
+    load(world, ada)
+    world.run(0.3)
+    home = base_of(bob).copy()
+    records = {number: world.server.records.get(number) for number in CARRIED}
+    joints = bob.robot.update(0.0).position
+    bob.physics.rigid.place_robot("bob", frames.pose([home[0], home[1] - 60.0, 0.0]), joints)
+    world.until(lambda: "ada" not in bob.remote_actors, 3.0)
+    assert bob.far_actors().keys() == {"ada"}
+    world.run(0.5)
+    for number in CARRIED:
+        assert bob.replicator.record(number) == records[number]
+        np.testing.assert_allclose(pose_of(bob, number)[:3], records[number].place[:3], atol=0.02)
+    assert not bob.replicator.owned
+    bob.physics.rigid.place_robot("bob", home, joints)
+    world.until(lambda: "ada" in bob.remote_actors, 1.0)
+    world.run(0.3)
+    for number in CARRIED:
+        assert world.server.records.get(number) == records[number]
+        assert position_difference(ada, bob, number) < 0.02
+
+
 def kill(world: World) -> np.ndarray:
     """End ada at once; where its base was [3] m."""
     place = base_of(world.clients["ada"])[:3].copy()

@@ -245,7 +245,7 @@ def count_bytes(endpoint: str, path: pathlib.Path | None, distance: float) -> li
             time.sleep(0.002)
 
         def all_matched() -> bool:
-            ready = ada.joined == ["bob"] and bob.joined == ["ada"] and ada.replicator._state.peers._layers[0].matching
+            ready = ada.joined == ["bob"] and bob.joined == ["ada"] and ada.replicator._state.peers._far.matching
             if distance < 5.0:
                 streams = [p.matching for p in ada.replicator._state.tree_channels.publishers[-1].values()]
                 ready &= (
@@ -283,11 +283,11 @@ def test_a_recorder_does_not_change_traffic(tmp_path, distance):
         path = tmp_path / "run.mcap"
         without_recorder = count_bytes(server.endpoint, None, distance)
         with_recorder = count_bytes(server.endpoint, path, distance)
-    # two runs begin at different phases of the poses' period, so one pose more may be due in one of them
-    assert np.abs(np.subtract(without_recorder, with_recorder)).max() <= POSE_SIZE
+    # two runs begin at different phases of the poses' periods, so one pose and one coarse pose more may be due in one
+    assert np.abs(np.subtract(without_recorder, with_recorder)).max() <= 2 * POSE_SIZE
     recorded = {entry.key for entry in read_recording(path).messages}
     assert ("tree/0/0/ada" in recorded) == (distance < 5.0)
-    assert "a/ada/far" in recorded
+    assert any(key.startswith("pose/") and key.endswith("/ada") for key in recorded)
 
 
 def test_a_full_disk_ends_a_recording_with_one_line(tmp_path):

@@ -136,12 +136,19 @@ class Client:
 
     @property
     def remote_actors(self) -> tuple[str, ...]:
-        """Names of the actors (robots and people) of other clients that are in this client's world, sorted."""
+        """Names of the actors (robots and people) of other clients that have bodies in this client's simulation: those
+        within 22 m, sorted. :attr:`far_actors` are the others."""
         return tuple(sorted(self._client.remote_actors))
 
+    @property
+    def far_actors(self) -> dict[str, np.ndarray]:
+        """Last known positions [3] m of the robots and people of other clients that have no body in this client's
+        simulation, by name, sorted. Each is known every 2 s, with more than 100 actors more rarely."""
+        return self._client.far_actors()
+
     def actor_pose(self, name: str) -> np.ndarray:
-        """Returns the pose [7] (m, quaternion xyzw) of the base of this client's robot or of a remote actor, by its
-        name. Raises ``KeyError`` for an unknown name."""
+        """Returns the pose [7] (m, quaternion xyzw) of the base of this client's robot or of a remote actor with a
+        body, by its name. Raises ``KeyError`` for another name. :attr:`far_actors` has the places of all others."""
         if name != self._client.name and name not in self._client.remote_actors:
             raise KeyError(f"no actor {name!r}; there are: {', '.join((self._client.name, *self.remote_actors))}")
         return self._client.physics.rigid.base_state(name)[0]

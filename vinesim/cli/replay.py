@@ -304,7 +304,7 @@ def _first_pose(tape: Recording) -> np.ndarray:
             with contextlib.suppress(MessageError):
                 if decode_hello(entry.payload).kind == kind:
                     such.add(sender_of(entry.key))
-        for entry in tape.messages.of("a") if such else ():
+        for entry in tape.messages.of("a", "pose") if such else ():
             if sender_of(entry.key) in such:
                 with contextlib.suppress(MessageError):
                     return decode_pose(entry.payload, "").base_q

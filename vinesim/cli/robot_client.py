@@ -220,7 +220,7 @@ def _add_behaviour(session: ClientSession, client: Client, task: Task | None, go
     watched = options.watch if options.watch is not None else options.push
     if watched is not None:
         session.trace(client, watched)
-    may_start = (lambda: client.remote_actors) if options.connect else (lambda: True)
+    may_start = (lambda: client.remote_actors or client.far_actors()) if options.connect else (lambda: True)
     for robot, goal in zip(client.robots.values(), goals, strict=False):
         client.pre_step.append(DriveTo(robot, goal, may_start=may_start))
     if options.push is not None and client.trace is not None:

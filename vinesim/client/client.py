@@ -17,7 +17,7 @@ import functools
 import logging
 import time
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 from concurrent.futures import Executor
 from typing import Any, NamedTuple
 
@@ -38,7 +38,7 @@ from vinesim.client.sound.exchange import SoundExchange
 from vinesim.client.world_time import WorldTime
 from vinesim.core import frames
 from vinesim.core.allocator import release_free_memory
-from vinesim.net.codec.control import Hello
+from vinesim.net.codec.control import Description, Hello
 from vinesim.net.codec.forces import COUPLINGS, WRENCHES, Coupling
 from vinesim.net.replication import interest
 from vinesim.net.replication.receiver import Inbox
@@ -71,6 +71,10 @@ def label_index(name: str) -> int:
 
 CLOCK_POLL_PERIOD = 0.005
 """Time between two checks for the server's first reply [s]."""
+
+
+BODY_KINDS = ("robot", "human")
+"""Kinds of actors that have bodies."""
 
 
 class Exchange(NamedTuple):
@@ -136,6 +140,8 @@ class Client:
         """Robots that this client simulates, by name; the first is :attr:`robot`."""
         self.humans: dict[str, LocalHuman] = {}
         """Humans that this client simulates, by name."""
+        self._descriptions: dict[str, Description] = {}
+        """Descriptions of robots by digest, for all local actors."""
         self.meshes = MeshExchange()
         """Sends the meshes of local robots to other clients, and receives the meshes of remote robots."""
         self.step_time: Callable[[], float] | None = None
@@ -206,7 +212,7 @@ class Client:
     @property
     def is_alone(self) -> bool:
         """Whether this client is alone in its world: it follows no server, and no other client is present."""
-        return not (self.world_time.is_shared or self.remote_actors)
+        return not (self.world_time.is_shared or self.remote_actors or self.replicator.peers)
 
     def reset(self) -> None:
         """Restore the scene as it was generated: plants, boxes and robots return to their start, at rest.
@@ -314,6 +320,7 @@ class Client:
             jitter_buffer=self._jitter_buffer,
             hand_force=self.physics.parameters.hand_force,
             link_centre=functools.partial(self._link_centre, hello.name),
+            descriptions=self._descriptions,
         )
 
     def follow_steps(self, step_time: Callable[[], float] | None) -> None:
@@ -373,20 +380,16 @@ class Client:
     # ------------------------------------------------------------------ the parts of a tick
 
     def receive(self, now: float) -> None:
-        """Add and remove remote actors, move their copies, and apply the states of trees and objects that they own."""
+        """Add and remove bodies of remote actors, move their copies, and apply the states of trees and objects that
+        they own."""
         inbox = self._receive_all(now)
         for hello in inbox.joined:
             log.info("%s joined as %s", hello.name, hello.kind)
-            if hello.kind in ("robot", "human"):
-                self.spawner.enqueue(hello)
         for name in inbox.left:
             self.objects.carrier_left(name)
-            self.spawner.cancel(name)
-            self.meshes.forget(name)
-            if (other := self.remote_actors.pop(name, None)) is not None:
-                self.spawner.remove(name, other)
-                log.info("%s left", name)
+            log.info("%s left", name)
         updates: dict[str, RobotUpdate | HumanUpdate] = {**inbox.robots, **inbox.people}
+        self._choose_bodies(updates.keys())
         spawned = self.spawner.spawn(updates)
         self.remote_actors.update(spawned)
         self.physics.contact_solver.remote_actors.difference_update(self.spawner.removed())
@@ -407,6 +410,34 @@ class Client:
             coupled_trees=self.couplings.trees,
         )
         self.objects.receive(inbox)
+
+    def _choose_bodies(self, near: Set[str]) -> None:
+        """Begin to make bodies of remote actors that are ``near`` now, and remove the bodies of those that are not."""
+        for name in sorted(near - self.remote_actors.keys()):
+            if self.spawner.may_enqueue(name) and (hello := self._describe(name)) is not None:
+                self.spawner.enqueue(hello)
+        for name in sorted((self.remote_actors.keys() | self.spawner.waiting) - near):
+            self.spawner.cancel(name)
+            self.meshes.forget(name)
+            if (other := self.remote_actors.pop(name, None)) is not None:
+                self.spawner.remove(name, other)
+
+    def _describe(self, name: str) -> Hello | None:
+        """Returns the hello of a remote robot, with its URDF, or of a remote human. None: it is a spectator, or its
+        description has not arrived yet."""
+        knowing = next((one for one in self.replicators.values() if one.is_peer(name)), None)
+        hello = None if knowing is None else knowing.describe(name)
+        return hello if hello is not None and hello.kind in BODY_KINDS else None
+
+    def far_actors(self) -> dict[str, np.ndarray]:
+        """Returns the last known positions [3] m of the robots and humans of other clients that have no body here, by
+        name, sorted: those that are far away, and those whose bodies are being made."""
+        hellos = self.replicator.peers
+        return {
+            name: place
+            for name, place in sorted(self.replicator.peer_positions().items())
+            if name not in self.remote_actors and hellos[name].kind in BODY_KINDS
+        }
 
     def control(self) -> None:
         """Call the functions of :attr:`pre_step`, then pass the set-points of robots and the poses of humans to the
@@ -594,15 +625,15 @@ class InterestAudit:
     def update(self, client: Client, touching: bool) -> None:
         """Count one tick. ``touching``: whether this client touched plants in it.
 
-        Positions of remote actors are those in their messages, because their copies appear later, and spectators have
-        no copy.
+        Positions of remote actors are those of the near ones in their messages, because their copies appear later, and
+        spectators have no copy.
         """
         replicators = client.replicators.values()
         sent = sum(replicator.counters.environment.bytes_out for replicator in replicators)
         if touching or sent != self._seen:
-            there = [position[:2] for replicator in replicators for position in replicator.peer_positions()]
+            there = np.concatenate([replicator.near_positions()[:, :2] for replicator in replicators])
             away = np.inf
-            if there:
+            if len(there):
                 here = [client.physics.rigid.actor_position(name)[:2] for name in client.replicators]
                 away = np.linalg.norm(np.reshape(here, (-1, 1, 2)) - np.reshape(there, (1, -1, 2)), axis=-1).min()
             if away > client.replicator.interest_radius + self.MARGIN:

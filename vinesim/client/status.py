@@ -105,7 +105,7 @@ class Status:
             "sound_dropped": client.sound.dropped,
             "bunches_picked": int((~client.physics.state.bunch_attached).sum()),
             "phase": "" if self._task is None else self._task.phase,
-            "others": sorted(client.remote_actors),
+            "others": sorted({*client.remote_actors, *client.far_actors()}),
             "topics": rates,
             "frame_rate": delivered / span,
             "frame_rate_asked": (delivered + missed) / span,

@@ -18,6 +18,7 @@ from vinesim.client.client import Client
 from vinesim.client.page.first_view import first_view
 from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.client.spectator import Spectator
+from vinesim.core import frames
 from vinesim.kernels.shading import materials
 from vinesim.rigid.human_posture import SIDES
 from vinesim.scene.appearance import load_human_model, load_shears
@@ -482,6 +483,7 @@ class PageWorld:
                 roots += [] if actor.pose is None else [actor.pose.root]
             else:
                 roots.append(client.physics.rigid.base_state(name)[0])
+        roots += [frames.pose(place) for place in client.far_actors().values()]
         return min(roots, key=lambda root: float(np.linalg.norm(root[:2] - client.pose[:2])), default=None)
 
 

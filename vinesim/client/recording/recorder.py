@@ -17,7 +17,7 @@ from collections.abc import Callable, Collection
 import numpy as np
 
 from vinesim.core import frames
-from vinesim.net.codec.control import Hello, decode_hello, encode_hello
+from vinesim.net.codec.control import Hello, decode_description, decode_hello, encode_hello
 from vinesim.net.codec.header import PROTOCOL, MessageError, WrongVersion, kind_of
 from vinesim.net.codec.human import decode_pose
 from vinesim.net.codec.messages import FAMILIES, sender_of
@@ -85,9 +85,13 @@ class Recorder:
         self._is_subscribed = False
         self._live: set[str] = set()
         self._asked: dict[str, float] = {}
+        self._described: dict[str, float] = {}
+        """Time of the last query for each robot's description [s], by digest; infinite: it was recorded."""
         self._rejected: set[str] = set()
         self._positions: dict[str, np.ndarray] = {}
-        self._far_poses: Subscription | None = None
+        self._all_poses: tuple[Subscription, ...] = ()
+        """Subscriptions to the poses that all actors send, wherever they are: those of their regions, and coarse
+        ones."""
         self._faster: dict[tuple[str, PoseLayer], tuple[Publisher, Subscription | None]] = {}
         """For each actor and each pose layer after the first: a publisher that reports whether the layer has
         subscribers, and this recorder's subscription to the layer, if any."""
@@ -132,7 +136,9 @@ class Recorder:
     def _subscribe(self) -> None:
         self._is_subscribed = True
         for name, family in FAMILIES.items():
-            if name != "a" and family.recorded_with in self._choices:  # poses: see _update_pose_subscriptions
+            if (
+                name not in ("a", "pose") and family.recorded_with in self._choices
+            ):  # poses: see _update_pose_subscriptions
                 self.bus.subscribe(f"{name}/**", KEEP_ALL)
         if "facts" in self._choices:
             self.bus.query("snap/*/*")  # records of earlier changes
@@ -157,6 +163,11 @@ class Recorder:
             if now - self._asked.get(name, -math.inf) >= ASK_PERIOD:
                 self._asked[name] = now
                 self.bus.query(f"hello/{name}")
+        for name, hello in sorted(self.greetings.items()):
+            digest = hello.robot_digest
+            if digest and now - self._described.get(digest, -math.inf) >= ASK_PERIOD:
+                self._described[digest] = now
+                self.bus.query(f"robot/{name}")
 
     def _process_replies(self) -> None:
         for key, payload, age in self.bus.replies():
@@ -166,6 +177,8 @@ class Recorder:
                     self._network_clock.receive(payload, age)
                 elif family == "hello" and name in self._live - self.greetings.keys() - self._rejected:
                     self._admit(name, payload)
+                elif family == "robot" and name in self.greetings:
+                    self._record_description(key, payload, self.greetings[name].robot_digest)
                 elif family == "snap":
                     self._put(key, payload)
             except MessageError:
@@ -189,6 +202,13 @@ class Recorder:
         self.greetings[name] = hello
         self._put(f"hello/{name}", payload)
 
+    def _record_description(self, key: str, payload: bytes, digest: str) -> None:
+        """Record the description of a robot, once for all robots that have the same."""
+        if self._described.get(digest) != math.inf:
+            decode_description(payload, digest)
+            self._described[digest] = math.inf
+            self._put(key, payload)
+
     def _reject(self, name: str, why: str) -> None:
         text = f"{name!r} {why}: record with the scene, seed and release of vinesim that are used there"
         if not self.greetings:
@@ -197,15 +217,15 @@ class Recorder:
         self._rejected.add(name)
 
     def _record(self, key: str, payload: bytes) -> None:
-        family, _, rest = key.partition("/")
+        family = key.partition("/")[0]
         try:
             kind_of(payload)
-            if family == "a":
-                name = rest.partition("/")[0]
+            if family in ("a", "pose"):
+                name = sender_of(key)
                 self._positions[name] = decode_pose(payload, name).base_q[:3]
         except MessageError:
             self.malformed += 1
-        if family == "a" and "poses" not in self._choices:
+        if family in ("a", "pose") and "poses" not in self._choices:
             return
         self._put(key, payload)
 
@@ -216,18 +236,21 @@ class Recorder:
         that another actor may have subscribed to. A pose layer is a share of an actor's poses
         (:data:`vinesim.net.replication.interest.POSE_LAYERS`)."""
         has_company = self._everything or len(self._live) >= 2
-        if has_company and self._far_poses is None:
-            self._far_poses = self.bus.subscribe(f"a/*{interest.POSE_LAYERS[0].suffix}", KEEP_ALL)
-        elif not has_company and self._far_poses is not None:
-            self._far_poses.close()
-            self._far_poses = None
+        if has_company and not self._all_poses:
+            region_key = interest.POSE_LAYERS[0].key.format(region="*/*", actor="*")
+            keys = (region_key, interest.FAR_KEY.format(actor="*"))
+            self._all_poses = tuple(self.bus.subscribe(key, KEEP_ALL) for key in keys)
+        elif not has_company and self._all_poses:
+            for subscription in self._all_poses:
+                subscription.close()
+            self._all_poses = ()
         for name, layer in [key for key in self._faster if key[0] not in self._live]:
             publisher, subscription = self._faster.pop((name, layer))
             publisher.close()
             if subscription is not None:
                 subscription.close()
         for name, layer in itertools.product(self._live, interest.POSE_LAYERS[1:]):
-            key = f"a/{name}{layer.suffix}"
+            key = layer.key.format(actor=name)
             if (name, layer) not in self._faster:
                 self._faster[name, layer] = self.bus.publisher(key), None
             publisher, subscription = self._faster[name, layer]
@@ -286,12 +309,16 @@ class Observer:
         bus.join(hello)
         bus.declare_queryable(f"hello/{bus.name}", lambda _: hello)
         self._positions = frames.pose([*place, 1.6])
-        self._pose = bus.publisher(f"a/{bus.name}/far")
+        region = interest.region_chunks(interest.cell_of(np.array(place), interest.REGION_SIZE))
+        self._pose = bus.publisher(interest.POSE_LAYERS[0].key.format(region=region, actor=bus.name))
+        self._far = bus.publisher(interest.FAR_KEY.format(actor=bus.name))
+        self._count = 0
+        """Number of positions that were published."""
         self._network_clock = NetworkClock(bus, now, time.time() - now)
         self._due = -math.inf
 
     def step(self, now: float) -> None:
-        """Publish this observer's position five times a second."""
+        """Publish this observer's position: five times a second for the actors around it, and rarely for all others."""
         self._network_clock.advance(now)
         self._network_clock.ping_if_due()
         for key, payload, age in self.bus.replies():
@@ -303,3 +330,6 @@ class Observer:
                 self.bus.name, self._network_clock.time, self._positions, np.zeros(6), np.zeros(0), np.zeros(0)
             )
             self._pose.put(encode_robot(update))
+            if self._count % (interest.FAR_EVERY // interest.POSE_LAYERS[0].every) == 0:
+                self._far.put(encode_robot(update))
+            self._count += 1

@@ -26,6 +26,7 @@ from vinesim.net.codec.control import (
     decode_hello,
     decode_records,
     decode_time,
+    description_digest,
     encode_hello,
     encode_records,
     encode_time,
@@ -61,10 +62,14 @@ class Playhead:
         self.greetings: dict[str, bytes] = {}
         """Encoded hello of each actor. It is known before the time at which it was recorded, because the recorder had
         to query it."""
+        self._descriptions: dict[str, bytes] = {}
+        """Encoded description of each robot, by digest."""
         self.records = RetainedState()
         """Retained records of all objects at the present position in the recording."""
         for entry in recording.messages.of("hello"):
             self.greetings.setdefault(sender_of(entry.key), entry.payload)
+        for entry in recording.messages.of("robot"):
+            self._descriptions.setdefault(description_digest(entry.payload), entry.payload)
         self._load_initial_records()
         times = recording.messages.times
         self._next = int(np.searchsorted(times, self.time, "left"))
@@ -86,6 +91,13 @@ class Playhead:
         for entry in entries:
             self._apply(entry)
         return entries
+
+    def description(self, name: str) -> bytes | None:
+        """Returns the encoded description of an actor's robot, or None."""
+        try:
+            return self._descriptions.get(decode_hello(self.greetings.get(name, b"")).robot_digest)
+        except MessageError:
+            return None
 
     def _load_initial_records(self) -> None:
         """Load the server's state at the beginning of the recording: its replies without records published later."""
@@ -200,6 +212,8 @@ class ReplayBus:
             self._reply(key, encode_time(asked, self.time))
         elif family == "hello" and rest in self._playhead.live and rest in self._playhead.greetings:
             self._reply(key, self._playhead.greetings[rest])
+        elif family == "robot" and (described := self._playhead.description(rest)) is not None:
+            self._reply(key, described)
         elif family == "snap":
             records = self._playhead.records
             asked = _cell(key)  # for a single cell, an empty state is also a reply
@@ -376,6 +390,8 @@ class Replay:
                 bus = self._buses[name] = self._live_bus(name)
                 bus.join(greeting)
                 bus.declare_queryable(f"hello/{name}", lambda _, greeting=greeting: greeting)
+                if (described := self.playhead.description(name)) is not None:
+                    bus.declare_queryable(f"robot/{name}", lambda _, described=described: described)
                 for key in self._keys.get(name, ()):
                     self._publishers[key] = bus.publisher(key, family_of(key).is_reliable)
 

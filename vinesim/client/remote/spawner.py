@@ -6,7 +6,7 @@ import concurrent.futures
 import dataclasses
 import functools
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 
 import numpy as np
 
@@ -41,7 +41,7 @@ class Prepared:
 
 
 class RemoteSpawner:
-    """Compiles worlds for remote actors that have no body on this client yet.
+    """Compiles worlds for near remote actors that have no body on this client yet.
 
     It also compiles a world when the bodies for free bunches run out, and when meshes of robots arrive after their
     bodies were made.
@@ -74,32 +74,45 @@ class RemoteSpawner:
         self._loading: dict[str, tuple[Hello, concurrent.futures.Future[RobotDescription]]] = {}
         """Robots of enqueued strangers that are being loaded, or are loaded, by name."""
         self._enqueued: dict[str, Hello] = {}
+        self._refused: set[str] = set()
+        """Names of enqueued actors that cannot be compiled."""
         self._leaving: dict[str, RemoteRobot | RemoteHuman] = {}
-        """Copies of actors that have left, kept until the world without them is compiled."""
+        """Copies of actors that have left or are far away, kept until the world without them is compiled."""
         self._removed: list[str] = []
         self._compiling: concurrent.futures.Future[Prepared] | None = None
 
     def __contains__(self, name: str) -> bool:
+        """Whether the body of an actor is being made."""
         return name in self._enqueued
 
+    def may_enqueue(self, name: str) -> bool:
+        """Whether the body of an actor is neither being made or removed nor refused."""
+        return name not in self.waiting and name not in self._leaving
+
+    @property
+    def waiting(self) -> Set[str]:
+        """Names of the near actors without a body, because it is being made or cannot be made."""
+        return self._enqueued.keys() | self._refused
+
     def enqueue(self, hello: Hello) -> None:
-        """Add an actor that has joined. It is spawned at its first pose."""
+        """Add an actor that has come near. It is spawned at its first pose."""
         self._enqueued[hello.name] = hello
         if self._loader is not None and hello.kind == "robot":
             work = functools.partial(resolve_description, hello, self.own, load=self._loader.load)
             self._loading[hello.name] = (hello, self._loader.submit(work))
 
     def cancel(self, name: str) -> None:
-        """Remove an actor that has left."""
+        """Forget an actor that has left or is far away."""
         self._enqueued.pop(name, None)
+        self._refused.discard(name)
         if (loading := self._loading.pop(name, None)) is not None:
             loading[1].cancel()
         self._spawned.pop(name, None)
         self._outdated.discard(name)
 
     def remove(self, name: str, copy: RemoteRobot | RemoteHuman) -> None:
-        """Start to remove the copy of an actor that has left. :meth:`removed` returns the actor's name when this is
-        done."""
+        """Start to remove the copy of an actor that has left or is far away. :meth:`removed` returns the actor's name
+        when this is done."""
         if self._executor is None:
             copy.remove()
             self._removed.append(name)
@@ -140,6 +153,7 @@ class RemoteSpawner:
             if self._enqueued.get(hello.name) is hello:
                 log.warning("the %s of %s cannot be shown: %s", hello.kind, hello.name, error)
                 self.cancel(hello.name)
+                self._refused.add(hello.name)
         hellos = [hello for hello, _ in prepared.actors]
         if any(self._enqueued.get(hello.name) is not hello or hello.name not in updates for hello in hellos):
             return {}  # an actor has left meanwhile, so compile again from the next step on

@@ -1,8 +1,8 @@
 """The start place of an actor that joins a world: the first one at which no other actor stands.
 
 Other actors are known by the poses that they publish. An actor that is live but has not published a pose is starting,
-too. Such actors take places in the order of their names, so that clients that start at the same time choose different
-places.
+too: actors around the start place publish five poses a second, and all others a coarse pose every two seconds. Such
+actors take places in the order of their names, so that clients that start at the same time choose different places.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from vinesim.client.tasks.start_poses import BASE_CLEARANCE, QUEUE_SPACING, ground_clearance, start_pose
 from vinesim.net.codec.header import MessageError
 from vinesim.net.codec.human import decode_pose
+from vinesim.net.codec.messages import sender_of
 from vinesim.net.replication import interest
 from vinesim.net.transport.bus import Bus
 from vinesim.scene.model import Model
@@ -32,8 +33,8 @@ STARTING_TIME = 3.0
 """Longest time for which an actor waits for the poses of actors that are starting [s]. From its choice to its first
 pose a client takes 0.6 s, more on a busy machine."""
 POSE_TIME = 0.5
-"""Longest time for which an actor with a given place waits for the poses of others [s]. Each arrives five times a
-second."""
+"""Longest time for which an actor with a given place waits for the poses of others [s]. Those of actors around that
+place arrive five times a second."""
 _POLL_PERIOD = 0.02
 _MAX_LAPS = 20
 """Number of rows of places that are tried behind the start places of a scene."""
@@ -48,28 +49,41 @@ class Others(NamedTuple):
     """Sorted names of the actors whose pose is unknown."""
 
 
-def find_others(bus: Bus, timeout: float, wait: Callable[[float], object] = time.sleep) -> Others:
-    """Returns the other live actors of the world of ``bus``, without spectators.
+def find_others(bus: Bus, start: np.ndarray, timeout: float, wait: Callable[[float], object] = time.sleep) -> Others:
+    """Returns the live actors in the window of regions around ``start`` [2 or 3] m, without spectators, and those that
+    have no pose yet.
 
-    Returns when the poses of all are known, at the latest after the ``timeout`` [s]. ``wait(seconds)`` lets time pass.
+    In a world of more than 100 actors coarse poses are so rare that an actor without one need not be starting. No actor
+    counts as starting then.
+
+    Returns when all live actors are known, at the latest after the ``timeout`` [s]. ``wait(seconds)`` lets time pass.
     """
-    far = interest.POSE_LAYERS[0].suffix
-    subscription = bus.subscribe(f"a/*{far}")
+    window = interest.cell_window(interest.cell_of(start, interest.REGION_SIZE))
+    key = interest.POSE_LAYERS[0].key
+    patterns = [key.format(region=interest.region_chunks(region), actor="*") for region in sorted(window)]
+    subscriptions = [bus.subscribe(pattern) for pattern in (*patterns, interest.FAR_KEY.format(actor="*"))]
     places: dict[str, np.ndarray | None] = {}
     for _ in range(round(timeout / _POLL_PERIOD)):
-        for key, payload in bus.poll():
-            name = key.removesuffix(far).removeprefix("a/")
+        for sent_under, payload in bus.poll():
+            name = sender_of(sent_under)
             try:
                 pose = decode_pose(payload, name)
             except MessageError:  # the client counts such messages when it has started
+                continue
+            if sent_under == interest.FAR_KEY.format(actor=name):
+                if interest.cell_of(pose.base_q, interest.REGION_SIZE) not in window:
+                    places.setdefault(name, None)
                 continue
             is_spectator = isinstance(pose, RobotUpdate) and not len(pose.position)
             places[name] = None if is_spectator else pose.base_q[:2]
         if not bus.alive() - {bus.name} - places.keys():
             break
         wait(_POLL_PERIOD)
-    subscription.close()
+    for subscription in subscriptions:
+        subscription.close()
     live = bus.alive() - {bus.name}
+    if interest.thinning(len(live), interest.POSE_RATE / interest.FAR_EVERY, interest.FAR_BUDGET) > 1:
+        live &= places.keys()
     return Others(
         {name: place for name in sorted(live & places.keys()) if (place := places[name]) is not None},
         tuple(sorted(live - places.keys())),
@@ -91,7 +105,7 @@ def choose_places(
     If ``number`` is given, the first actor starts there, and a warning says if another actor stands there. Otherwise
     each actor takes the first free place, and a warning says which places were taken.
     """
-    others = find_others(bus, STARTING_TIME if number is None else POSE_TIME, wait)
+    others = find_others(bus, start_pose(scene, number or 0), STARTING_TIME if number is None else POSE_TIME, wait)
     taken = list(others.places.items())
     starting = [name for name in others.starting if name < bus.name]
     chosen: list[int] = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from typing import Any, NamedTuple
 
@@ -27,12 +28,14 @@ from vinesim.net.pace import MIN_FACTOR, PaceReport
 from vinesim.net.replication.authority import Claim
 from vinesim.scene.ids import LABEL_STRIDE
 from vinesim.scene.robot_limits import MAX_JOINTS, urdf_objection
+from vinesim.scene.triangles import is_digest
 
 CLAIMS = 3
 RETAINED = 4
 HELLO = 16
 CLOCK = 17
 WELCOME = 18
+DESCRIPTION = 22
 """Numbers of the kinds of messages in this module. The fourth byte of a message is the number of its kind."""
 
 MAX_RECORDS = 4096
@@ -51,8 +54,12 @@ ACTOR_KINDS = ("robot", "human", "spectator")
 """Values of :attr:`Hello.kind`."""
 
 
-class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Self-description of an actor, sent to the server and to every peer."""
+class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Self-description of an actor, sent to the server and to every peer.
+
+    :attr:`urdf` and :attr:`sidecar` are not sent with it. Only clients that give the robot a body ask for them, by
+    :attr:`robot_digest`, once for all robots that have the same (:func:`encode_description`).
+    """
 
     name: str
     """Name of the actor, unique in its world: see :func:`vinesim.net.codec.header.is_valid_name`."""
@@ -80,6 +87,8 @@ class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Height of a person [m], in :data:`HEIGHT_RANGE`."""
     outfit: str = ""
     """Name of the outfit that a person has chosen; empty: the outfit is derived from the person's name."""
+    robot_digest: str = ""
+    """Digest of URDF and sidecar, by :func:`description_digest`; empty: the actor has none."""
 
 
 class Welcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -161,15 +170,17 @@ def unpack(payload: bytes, kind: int, name: str, decoder: msgspec.msgpack.Decode
 
 
 def encode_hello(hello: Hello) -> bytes:
-    """Encode a hello. Raises :class:`MessageError` if its name cannot be part of a key, a number is out of its range,
-    or the message is too large."""
+    """Encode a hello without its URDF and sidecar, whose digest it contains.
+
+    Raises :class:`MessageError` if its name cannot be part of a key or a number is out of its range.
+    """
     if not is_valid_name(hello.name):
         raise MessageError(f"actor name {hello.name!r}: use 1 to 48 letters, digits, '_', '-' or '.'")
+    if hello.urdf or hello.sidecar:
+        digest = description_digest(encode_description(hello))
+        hello = msgspec.structs.replace(hello, urdf="", sidecar="", robot_digest=digest)
     _check_hello(hello)
-    payload = pack(HELLO, hello)
-    if len(payload) > MAX_MESSAGE:
-        raise MessageError(f"greeting of {len(payload)} B, at most {MAX_MESSAGE} B: the URDF is too long")
-    return payload
+    return pack(HELLO, hello)
 
 
 def decode_hello(payload: bytes) -> Hello:
@@ -180,13 +191,53 @@ def decode_hello(payload: bytes) -> Hello:
         raise MessageError(f"greeting of an actor named {hello.name[:60]!r}")
     if hello.protocol != PROTOCOL:
         raise WrongVersion(hello.protocol)
+    if hello.urdf or hello.sidecar:
+        raise MessageError(f"greeting of {hello.name!r} with a URDF: only the reply to a query has it")
     _check_hello(hello)
     return hello
 
 
+def encode_description(hello: Hello) -> bytes:
+    """Encode URDF and sidecar of a robot. Raises :class:`MessageError` if they exceed a limit."""
+    payload = pack(DESCRIPTION, (hello.urdf, hello.sidecar))
+    if len(payload) > MAX_MESSAGE:
+        raise MessageError(f"description of {len(payload)} B, at most {MAX_MESSAGE} B: the URDF is too long")
+    if objection := urdf_objection(hello.urdf):
+        raise MessageError(f"description of {hello.name!r}: {objection}")
+    return payload
+
+
+def description_digest(payload: bytes) -> str:
+    """Returns the digest of an encoded description: BLAKE2b of 160 bits in hexadecimal, without the first 4 bytes,
+    which contain the version."""
+    return hashlib.blake2b(payload[4:], digest_size=20).hexdigest()
+
+
+class Description(NamedTuple):
+    """What a hello names by its digest only."""
+
+    urdf: str
+    sidecar: str
+
+    def complete(self, hello: Hello) -> Hello:
+        """Returns a hello with this URDF and sidecar."""
+        return msgspec.structs.replace(hello, urdf=self.urdf, sidecar=self.sidecar)
+
+
+def decode_description(payload: bytes, digest: str) -> Description:
+    """Decode URDF and sidecar of a robot. Raises :class:`MessageError` if the message is invalid or has another
+    ``digest``."""
+    urdf, sidecar = unpack(payload, DESCRIPTION, "description", _description_decoder)
+    if (found := description_digest(payload)) != digest:
+        raise MessageError(f"description with the digest {found[:8]}, the greeting announced {digest[:8]!r}")
+    if objection := urdf_objection(urdf):
+        raise MessageError(f"description {digest[:8]}: {objection}")
+    return Description(urdf, sidecar)
+
+
 def _check_hello(hello: Hello) -> None:
-    """Raise :class:`MessageError` unless the kind of actor exists, the outfit is a name, each number is in its range,
-    and the URDF is within :mod:`vinesim.scene.robot_limits`."""
+    """Raise :class:`MessageError` unless the kind of actor exists, the outfit is a name, the digest is one, and each
+    number is in its range."""
     if hello.kind not in ACTOR_KINDS:
         raise MessageError(f"greeting of {hello.name!r} with kind {hello.kind[:60]!r}, not {', '.join(ACTOR_KINDS)}")
     if hello.outfit and not is_valid_name(hello.outfit):
@@ -201,8 +252,8 @@ def _check_hello(hello: Hello) -> None:
     ):
         if not low <= value <= high:
             raise MessageError(f"greeting of {hello.name!r} with {what} {value}, not from {low} to {high}")
-    if objection := urdf_objection(hello.urdf):
-        raise MessageError(f"greeting of {hello.name!r}: {objection}")
+    if hello.robot_digest and not is_digest(hello.robot_digest):
+        raise MessageError(f"greeting of {hello.name!r} with the digest {hello.robot_digest[:60]!r}")
 
 
 def encode_welcome(welcome: Welcome) -> bytes:
@@ -335,8 +386,7 @@ HELLO_FIELDS = {
     "name": TEXT,
     "kind": TEXT,
     "robot": TEXT,
-    "urdf": TEXT,
-    "sidecar": TEXT,
+    "robot_digest": TEXT,
     "scene": TEXT,
     "digest": TEXT,
     "seed": COUNT,
@@ -351,7 +401,18 @@ HELLO_FIELDS = {
 
 def describe_hello(payload: bytes, _: str) -> dict[str, Any]:
     """Decode a hello for the JSON of a recording."""
-    return msgspec.to_builtins(decode_hello(payload))
+    hello = decode_hello(payload)
+    return {name: getattr(hello, name) for name in HELLO_FIELDS}
+
+
+DESCRIPTION_FIELDS = {"digest": TEXT, "urdf": TEXT, "sidecar": TEXT}
+"""JSON schema of what :func:`describe_description` returns."""
+
+
+def describe_description(payload: bytes, _: str) -> dict[str, Any]:
+    """Decode the description of a robot for the JSON of a recording."""
+    digest = description_digest(payload)
+    return {"digest": digest, **decode_description(payload, digest)._asdict()}
 
 
 CLAIMS_FIELDS = {"claims": list_of(object_of("claim", "who says to own a thing", owner=TEXT, touched=YES, **THING))}
@@ -406,6 +467,8 @@ def describe_records(payload: bytes, _: str) -> dict[str, Any]:
 _encoder = msgspec.msgpack.Encoder()
 
 _hello_decoder = msgspec.msgpack.Decoder(Hello)
+
+_description_decoder = msgspec.msgpack.Decoder(tuple[str, str])
 
 _welcome_decoder = msgspec.msgpack.Decoder(Welcome)
 

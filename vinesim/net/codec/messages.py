@@ -40,8 +40,8 @@ class Message(NamedTuple):
 
 
 _ROWS = (
-    Message(robot.ROBOT, ("a",), True, human.describe_pose, human.POSE_FIELDS),
-    Message(human.HUMAN, ("a",), True, human.describe_pose, human.POSE_FIELDS),
+    Message(robot.ROBOT, ("a", "pose"), True, human.describe_pose, human.POSE_FIELDS),
+    Message(human.HUMAN, ("a", "pose"), True, human.describe_pose, human.POSE_FIELDS),
     Message(trees.TREES, ("tree", "near", "own"), True, trees.describe_trees, trees.TREES_FIELDS),
     Message(objects.OBJECTS, ("c",), True, objects.describe_objects, objects.OBJECTS_FIELDS),
     Message(control.CLAIMS, ("own",), False, control.describe_claims, control.CLAIMS_FIELDS),
@@ -50,6 +50,13 @@ _ROWS = (
     Message(forces.COUPLINGS, ("force",), True, forces.describe_couplings, forces.COUPLINGS_FIELDS),
     Message(voice.VOICE, ("voice",), True),
     Message(control.HELLO, ("hello", "join"), False, control.describe_hello, control.HELLO_FIELDS),
+    Message(
+        control.DESCRIPTION,
+        ("robot",),
+        False,
+        control.describe_description,
+        control.DESCRIPTION_FIELDS,
+    ),
     Message(control.WELCOME, ("join",)),
     Message(control.CLOCK, ("clock",)),
     Message(meshes.MESH_PART, ("mesh", "offer")),
@@ -91,6 +98,14 @@ class Family(NamedTuple):
 
 
 FAMILIES = {
+    "pose": Family(
+        ("pose/*/*/{actor}",),
+        "actor",
+        "foxglove.PoseInFrame",
+        "Where an actor is, and its joints.",
+        "poses",
+        by_spectators=True,
+    ),
     "a": Family(
         ("a/{actor}", "a/{actor}/far", "a/{actor}/mid", "a/{actor}/near"),
         "actor",
@@ -127,6 +142,9 @@ FAMILIES = {
     "voice": Family(("voice/{actor}", "voice/{actor}/pcm"), "voice", by_spectators=True),
     "hello": Family(
         ("hello/{actor}",), "control", "vinesim.Greeting", "How an actor introduced itself.", is_published=False
+    ),
+    "robot": Family(
+        ("robot/{actor}",), "control", "vinesim.Robot", "The URDF of a robot, and its sidecar.", is_published=False
     ),
     "snap": Family(("snap/*/*",), "control", "vinesim.Facts", "What was true before.", is_published=False),
     "live": Family(

@@ -24,6 +24,7 @@ from vinesim.net.codec.messages import FAMILIES, MESSAGES, sender_of
 from vinesim.net.codec.objects import OBJECTS, ObjectStates, check_object_id, decode_objects
 from vinesim.net.codec.trees import RESTING, TOUCHED, TreeStates, decode_trees
 from vinesim.net.codec.wood import decode_wood
+from vinesim.net.replication import interest
 from vinesim.net.replication.authority import NO_OWNER, Claim
 from vinesim.net.replication.interest import Cell
 from vinesim.net.replication.replication_state import SPECTATOR, ReplicationState, put_counted
@@ -56,10 +57,10 @@ class Inbox:
     joined: list[Hello] = dataclasses.field(default_factory=list)
     left: list[str] = dataclasses.field(default_factory=list)
     robots: dict[str, RobotUpdate] = dataclasses.field(default_factory=dict)
-    """Poses of all peers that are robots or spectators, by name. They are extrapolated by at most 150 ms, and
+    """Poses of the near peers that are robots or spectators, by name. They are extrapolated by at most 150 ms, and
     corrections are blended in over 100 ms."""
     people: dict[str, HumanUpdate] = dataclasses.field(default_factory=dict)
-    """Poses of all peers that are people, by name, extrapolated and blended like :attr:`robots`."""
+    """Poses of the near peers that are people, by name, extrapolated and blended like :attr:`robots`."""
     messages: dict[int, Any] = dataclasses.field(default_factory=dict)
     """Contents of direct messages to this actor that are valid now, by kind of message: results of
     :meth:`vinesim.net.replication.direct_messages.MessageSync.current`."""
@@ -179,7 +180,7 @@ class Receiver:
             state.object_stream.remove(object_id)
         inbox.trees = state.tree_stream.extrapolated(step.new_trees, now, time)
         inbox.objects = state.object_stream.extrapolated(state.ownership.remote, now, time)
-        poses = [peer.sample(time, now) for peer in peers.known.values() if peer.update is not None]
+        poses = [peer.sample(time, now) for _, peer in sorted(peers.near.items()) if peer.update is not None]
         inbox.robots = {update.actor: update for update in poses if isinstance(update, RobotUpdate)}
         inbox.people = {update.actor: update for update in poses if isinstance(update, HumanUpdate)}
         inbox.messages = {kind: sync.current(now) for kind, sync in state.syncs.items()}
@@ -198,6 +199,8 @@ class Receiver:
         peer = state.peers.known.get(sender)
         if peer is None and not (family == "fact" and state.peers.was_admitted(sender)):
             if sender not in state.peers.local_actors:
+                if key != interest.FAR_KEY.format(actor=sender):
+                    state.peers.ask_soon(sender)
                 counters.dropped += self._keep_early(sender, key, payload) if family == "fact" else 1
             return
         try:
@@ -206,9 +209,12 @@ class Receiver:
             kind = kind_of(payload)
             if kind not in MESSAGES or family not in MESSAGES[kind].families:
                 raise MessageError(f"message of kind {kind} under {key!r}, where there is none of this kind")
-            if family == "a":
+            if family in ("a", "pose"):
                 assert peer is not None
-                counters.dropped += not peer.receive(decode_pose(payload, sender), step.time)
+                is_coarse = key == interest.FAR_KEY.format(actor=sender)
+                counters.dropped += not state.peers.receive_pose(
+                    peer, decode_pose(payload, sender), step.time, is_coarse=is_coarse
+                )
             elif kind in state.syncs:
                 assert peer is not None
                 state.syncs[kind].receive(payload, peer, step.now, step.time)

@@ -35,6 +35,10 @@ class RemotePose:
         self.update: RobotUpdate | HumanUpdate | None = None
         self.near: list[Subscription] = []
         """Subscriptions to the layers of the peer's poses after the first one; empty while the peer is far."""
+        self.place: np.ndarray | None = None
+        """Last known position [3] m of the peer, from any of its poses; None: unknown."""
+        self.placed_at = -1e9
+        """Network time of :attr:`place` [s], as the peer states it."""
         self.moved_at = -1e9
         self._turns = _TURNS if hello.kind == "human" else _BASE
         """Indices [k, 4] of the quaternions in the flat array of a pose."""
@@ -61,6 +65,7 @@ class RemotePose:
             if len(update.position) != self.joints:
                 raise MessageError(f"pose of {update.actor!r} with {len(update.position)} joints, it has {self.joints}")
         shown = None if self.update is None else self._shown(time)
+        self.put(update, time)
         self.update = update
         self._cached = None
         self._state, self._rate = _numbers(update)
@@ -76,11 +81,31 @@ class RemotePose:
             self.moved_at = time
         return True
 
+    def put(self, update: RobotUpdate | HumanUpdate, time: float) -> bool:
+        """Store only the position in a pose of the peer that arrived at network ``time`` [s]. Returns False if the pose
+        is older than the last one."""
+        stated = min(update.time, time + dead_reckoning.MAX_CLOCK_SKEW)
+        if stated < self.placed_at:
+            return False
+        self.place = update.base_q[:3]
+        self.placed_at = stated
+        return True
+
+    def forget(self) -> None:
+        """Forget the peer's poses, but not its position, because the peer is far away now."""
+        for channel in self.near:
+            channel.close()
+        self.near.clear()
+        self.update = self._cached = None
+        self._buffer = JitterBuffer(self._buffer.delay)
+        self._correction = np.zeros(0)
+
     def shift_time(self, step: float) -> None:
         """Shift all stored times, because the network clock was set by ``step`` [s].
 
         Of a jitter buffer only the newest pose is kept.
         """
+        self.placed_at += step
         if self.update is not None:
             self.update = dataclasses.replace(self.update, time=self.update.time + step)
             self.moved_at += step

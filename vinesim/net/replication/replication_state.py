@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vinesim.net.codec.control import Hello
+from vinesim.net.codec.control import Description, Hello
 from vinesim.net.codec.messages import Counters, Traffic
 from vinesim.net.replication import authority, interest
 from vinesim.net.replication.cell_channels import CellChannels, TreeChannels
@@ -37,6 +37,7 @@ class ReplicationState:
         jitter_buffer: float,
         hand_force: float,
         link_centre: LinkCentre,
+        descriptions: dict[str, Description] | None = None,
     ) -> None:
         self.bus = bus
         self.hello = hello
@@ -44,7 +45,7 @@ class ReplicationState:
         self.cells = CellChannels(bus, interest_radius)
         self.tree_channels = TreeChannels(bus, interest_radius)
         self.counters = Counters()
-        self.peers = PeerRegistry(bus, hello, self.counters, jitter_buffer)
+        self.peers = PeerRegistry(bus, hello, self.counters, jitter_buffer, descriptions)
         self.ownership = Ownership(hello.name, self.peers.known)
         self.voices = VoiceSync(bus, hello, self.counters)
         direct = make_syncs(
@@ -109,7 +110,7 @@ class ReplicationState:
 
         ``distance`` [m]: within which a peer is near; None: the interest radius.
         """
-        others = np.array(list(self.peers.positions().values())).reshape(-1, 3)
+        others = self.peers.near_positions()
         return interest.count_listeners(positions, others, distance or self.cells.interest_radius)
 
 

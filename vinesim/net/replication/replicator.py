@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from vinesim.net.codec.control import Hello, RetainedRecord
+from vinesim.net.codec.control import Description, Hello, RetainedRecord
 from vinesim.net.codec.messages import MESSAGES, Counters
 from vinesim.net.pace import PaceReport
 from vinesim.net.replication import interest
@@ -52,6 +52,7 @@ class Replicator:
         jitter_buffer: float = 0.0,
         hand_force: float = HAND_FORCE,
         link_centre: LinkCentre = lambda _: None,
+        descriptions: dict[str, Description] | None = None,
     ) -> None:
         """Join the world of ``bus`` with the actor that ``hello`` describes.
 
@@ -59,7 +60,8 @@ class Replicator:
         ``jitter_buffer``: delay with which poses of peers are shown [s] (:mod:`vinesim.net.replication.jitter_buffer`).
         ``hand_force``: largest force of each hand of a person that pushes this robot [N]. ``link_centre(link)``: centre
         of mass [3] m of a link of this robot, None if the link does not exist. Without this function people of other
-        clients cannot push the robot.
+        clients cannot push the robot. ``descriptions``: known descriptions of robots by digest, which the actors of one
+        client share.
 
         Raises ValueError if the hello has another name than the bus.
         """
@@ -76,6 +78,7 @@ class Replicator:
             jitter_buffer=jitter_buffer,
             hand_force=hand_force,
             link_centre=link_centre,
+            descriptions=descriptions,
         )
         self._receiver = Receiver(self._state)
         self._sender = Sender(self._state)
@@ -145,9 +148,24 @@ class Replicator:
         """Hellos of all peers that are in this world now, by name."""
         return {name: peer.hello for name, peer in self._state.peers.known.items()}
 
-    def peer_positions(self) -> list[np.ndarray]:
-        """Returns the positions [3] m of all peers whose pose is known, including spectators."""
-        return list(self._state.peers.positions().values())
+    def is_peer(self, name: str) -> bool:
+        """Whether an actor is a peer in this world now."""
+        return name in self._state.peers.known
+
+    def peer_positions(self) -> dict[str, np.ndarray]:
+        """Returns the last known positions [3] m of all peers, including spectators and far ones, by name."""
+        return self._state.peers.positions()
+
+    def near_positions(self) -> np.ndarray:
+        """Returns the positions [k, 3] m of the peers that are near, including spectators."""
+        return self._state.peers.near_positions()
+
+    def describe(self, name: str) -> Hello | None:
+        """Returns the hello of a peer with its URDF; None: it is not known yet, and was queried.
+
+        Raises KeyError if ``name`` is no peer.
+        """
+        return self._state.peers.describe(name, self.received_at)
 
     @property
     def offset(self) -> float:

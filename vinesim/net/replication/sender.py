@@ -127,8 +127,8 @@ class Sender:
         trees = {state.tree_stream.layer_cell[object_id] for object_id in state.ownership.owned if is_tree(object_id)}
         state.tree_channels.update(state.cells.position, trees)
         state.retained.update_window(state.cells.subscriptions, state.cells.changes, now)
-        state.peers.update_interest(state.cells.position)
-        state.voices.update_interest(state.peers.known, state.cells.position, now)
+        if state.peers.update_interest(state.cells.position, now):
+            state.voices.update_interest(state.peers.known, state.cells.position, now)
 
     # ------------------------------------------------------------ moving
 

@@ -9,6 +9,7 @@ may not hear. A key without a subscriber costs nothing.
 from __future__ import annotations
 
 import collections
+import math
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
@@ -152,10 +153,10 @@ class VoiceSync(MessageSync):
         setting = self._bus.spectators_speak_to
         wanted = set()
         for name, peer in peers.items() if self.listens else ():
-            if peer.update is None:
+            if peer.place is None:
                 continue
             reach = REACH * LAYER_HYSTERESIS if name in self._sources else REACH
-            is_near = np.hypot(*(peer.update.base_q[:2] - here[:2])) <= reach
+            is_near = math.dist(peer.place[:2], here[:2]) <= reach
             if is_near and may_hear(peer.hello.kind, self._hello.kind, setting):
                 wanted.add(name)
         self._drop(self._sources.keys() - wanted)
@@ -169,14 +170,14 @@ class VoiceSync(MessageSync):
         Raises :class:`MessageError` if the frame is invalid, or its time is too far from the present.
         """
         source = self._sources.get(sender.hello.name)
-        pose = sender.update
-        if source is None or pose is None or not source.admit(now):
+        if source is None or sender.place is None or not source.admit(now):
             self._counters.dropped += 1
             return
         frame = decode_voice(payload)
         if abs(frame.time - time) > MAX_AGE:
             raise MessageError(f"frame of sound of {frame.time - time:+.1f} s from now")
-        self._heard.append(Heard(sender.hello, frame, mouth(sender.hello.kind, pose)))
+        place = sender.place if sender.update is None else mouth(sender.hello.kind, sender.update)
+        self._heard.append(Heard(sender.hello, frame, place))
 
     def take(self) -> list[Heard]:
         """Returns the frames that arrived since the last call."""

@@ -137,9 +137,16 @@ def acl_config(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
             "subscribe", "ingress", ["declare_subscriber", "liveliness_query", "declare_liveliness_subscriber"], world
         ),
         rule(
-            "query", "ingress", ["query"], f"{root}/hello/*", f"{root}/holder/*", f"{root}/snap/*/*", f"{root}/mesh/*"
+            "query",
+            "ingress",
+            ["query"],
+            f"{root}/hello/*",
+            f"{root}/robot/*",
+            f"{root}/holder/*",
+            f"{root}/snap/*/*",
+            f"{root}/mesh/*",
         ),
-        rule("be queried", "egress", ["query"], f"{root}/hello/*"),
+        rule("be queried", "egress", ["query"], f"{root}/hello/*", f"{root}/robot/*"),
         # without declarations of subscribers publishers would never match, and never send
         rule("see queryables", "egress", ["declare_queryable"], world),
         rule("see subscribers", "egress", ["declare_subscriber"], world),
@@ -147,7 +154,7 @@ def acl_config(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
     for name, role in sorted(actors.items()):
         if role == Role.SERVER:
             continue
-        about_itself = (f"{root}/live/{name}/*", f"{root}/hello/{name}")
+        about_itself = (f"{root}/live/{name}/*", f"{root}/hello/{name}", f"{root}/robot/{name}")
         own = [
             rule(f"{name} is there", "ingress", ["liveliness_token", "declare_queryable", "reply"], *about_itself),
             rule(

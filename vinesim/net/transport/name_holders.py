@@ -23,7 +23,7 @@ MAX_FORMER_SESSIONS = 8
 MAX_FORMER_NAMES = 256
 """Largest number of names without a live session that are still stored."""
 
-BOUND_FAMILIES = frozenset(name for name, family in FAMILIES.items() if family.is_published) | {"hello"}
+BOUND_FAMILIES = frozenset(name for name, family in FAMILIES.items() if family.is_published) | {"hello", "robot"}
 """Families of keys that contain the name of the actor that may send under them, by their first chunk."""
 
 
