@@ -78,12 +78,35 @@ def _file_fuzz(files: int, seed: int, first: int, kinds: str) -> Iterator[Measur
     return _call("file_fuzz:file_fuzz")(files, seed, first, kinds, _announce)
 
 
-def _soak(minutes: float, real_time_factor: float | None) -> Iterator[Measurement]:
+def _soak(
+    minutes: float,
+    real_time_factor: float | None,
+    robots: int,
+    people: int,
+    sensor_hz: float,
+    kill_every: float,
+    record: pathlib.Path | None,
+) -> Iterator[Measurement]:
     if minutes <= 0.0:
         raise UsageError(f"--minutes is {minutes:g}: give more than 0")
     if real_time_factor is not None and not 0.01 <= real_time_factor <= 1.0:
         raise UsageError(f"--real-time-factor is {real_time_factor:g}: give 0.01 to 1")
-    return _call("soak:soak")(minutes, real_time_factor, _announce)
+    if robots < 1:
+        raise UsageError(f"--robots is {robots}: give 1 or more")
+    if people < 0:
+        raise UsageError(f"--people is {people}: give 0 or more")
+    if sensor_hz <= 0.0:
+        raise UsageError(f"--sensor-hz is {sensor_hz:g}: give more than 0")
+    if kill_every < 0.0:
+        raise UsageError(f"--kill-every is {kill_every:g}: give 0 or more")
+    cast = _call("soak:Cast")(
+        robots=robots,
+        people=people,
+        real_time_factor=real_time_factor,
+        sensor_hz=sensor_hz,
+        kill_every=kill_every,
+    )
+    return _call("soak:soak")(cast, minutes, record, _announce)
 
 
 def _coverage(seeds: int, first: int, plants: str, tracks: str) -> Iterator[Measurement]:
@@ -212,13 +235,22 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
     ),
     "soak": (
         _soak,
-        "memory, threads and open files in a long run (Linux)",
+        "delivery, open files, memory, recovery of the server and publishing in a long run (Linux)",
         {
             "minutes": {"type": float, "default": 60.0, "help": "measured time"},
             "real-time-factor": {
                 "type": float,
                 "help": "rate of the world's time (default: as fast as all clients can follow)",
             },
+            "robots": {"type": int, "default": 4, "help": "number of robots"},
+            "people": {"type": int, "default": 2, "help": "number of people"},
+            "sensor-hz": {"type": float, "default": 1.0, "help": "rate of each robot's pictures in real time"},
+            "kill-every": {
+                "type": float,
+                "default": 0.0,
+                "help": "minutes between two kills of the server, which starts again at once; 0: none",
+            },
+            "record": {"type": pathlib.Path, "help": "file of the figures so far, written every five minutes"},
         },
     ),
 }
