@@ -212,16 +212,23 @@ class AdmissionControl:
             self._forget(world)
         return gone
 
-    def may_publish(self, world: str, name: str, session: str) -> bool:
-        """Whether a session may publish records under a name: it was admitted with this name, and not as a spectator.
+    def publisher(self, world: str, name: str) -> str:
+        """Returns the session that may publish records under a name: it was admitted with this name, and not as a
+        spectator. Empty: none may.
 
         A server that was restarted has not admitted the actor yet. Until then the only live session with the name may
         publish.
         """
         actor = (world, name)
         if actor in self._admitted:
-            return self._admitted[actor].session == session and actor not in self._spectators
-        return self._alive.get(actor) == {session}
+            return "" if actor in self._spectators else self._admitted[actor].session
+        alive = self._alive.get(actor, set())
+        return "".join(alive) if len(alive) == 1 else ""
+
+    def refuse(self, reason: str) -> Welcome:
+        """Count a join that is refused for a ``reason`` that this object does not know of, and return the reply."""
+        self.refused += 1
+        return Welcome(reason)
 
     def decide(self, world: str, name: str, session: str, greeting: bytes, now: float, address: str = "") -> Welcome:
         """Admit or reject an actor that sends the encoded hello ``greeting``, and return the reply to it.
