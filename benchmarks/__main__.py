@@ -109,6 +109,14 @@ def _soak(
     return _call("soak:soak")(cast, minutes, record, _announce)
 
 
+def _hostile_actor(minutes: float, seed: int) -> Iterator[Measurement]:
+    if minutes <= 0.0:
+        raise UsageError(f"--minutes is {minutes:g}: give more than 0")
+    if seed < 0:
+        raise UsageError(f"--seed is {seed}: give 0 or more")
+    return _call("hostile_actor:hostile_actor")(minutes, seed, _announce)
+
+
 def _coverage(seeds: int, first: int, plants: str, tracks: str) -> Iterator[Measurement]:
     if seeds < 1:
         raise UsageError(f"--seeds is {seeds}: give 1 or more")
@@ -231,6 +239,14 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
             "synthetic": {"action": "append", "required": True, "help": "folder of `vinesim dataset`; may be repeated"},
             "limit": {"type": int, "help": "read at most this number of pictures of each synthetic folder"},
             "out": {"help": "file for the table in Markdown"},
+        },
+    ),
+    "hostile_actor": (
+        _hostile_actor,
+        "an admitted actor tries everything that it may: processor time of a step of another client (Linux)",
+        {
+            "minutes": {"type": float, "default": 10.0, "help": "time under attack"},
+            "seed": {"type": int, "default": 0, "help": "seed of the broken messages"},
         },
     ),
     "soak": (

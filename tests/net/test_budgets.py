@@ -49,6 +49,7 @@ def stranger(endpoint: str):
         yield session
     finally:
         close_session(session)
+        del IDENTITIES[identity.session]
 
 
 def ask_to_join(session: zenoh.Session, world: str, name: str, who: str = "", **more) -> Welcome:
@@ -302,6 +303,7 @@ def test_the_memory_of_a_server_and_of_a_client_does_not_grow_with_joins_and_lea
     monkeypatch.setattr(logging.root.manager, "disable", logging.CRITICAL)  # pytest keeps what is logged
     monkeypatch.setattr(admission, "JOIN_BURST_TIME", 1.0)
     monkeypatch.setattr("vinesim.net.server.server.MAX_WARNED", 20)
+    monkeypatch.setattr("vinesim.net.server.server.MAX_KNOWN_SESSIONS", 20)
     monkeypatch.setattr(name_holders, "MAX_FORMER_NAMES", 50)
     monkeypatch.setattr(retained_store, "MAX_BUCKETS", 50)
     monkeypatch.setattr(retained_store, "BURST_TIME", 0.1)

@@ -14,7 +14,7 @@ import pytest
 from tests.support.waiting import deadline
 from vinesim.client.client import Client
 from vinesim.client.programs import START_TIMEOUT, Program, ProgramGroup, free_port, program_group
-from vinesim.client.tasks.start_poses import bunch_centres
+from vinesim.client.tasks.start_poses import bunch_centres, start_pose
 from vinesim.core import frames
 from vinesim.net.codec.control import RetainedRecord
 from vinesim.net.transport.zenoh_bus import ZenohBus
@@ -40,9 +40,11 @@ class Clients:
     @staticmethod
     def _start(group: ProgramGroup, endpoint: str, i: int, options: tuple[str, ...]) -> Program:
         name = f"robot_{i}"
+        pose = start_pose(load_scene(SCENE), 0, queue=i)
+        place = ("--pose", *(f"{value:.4f}" for value in (*pose[:2], frames.to_yaw(pose[3:]))))
         common = ("--connect", endpoint, "--scene", SCENE, "--no-ros", "--sensor-hz", "0.1", "--status", "json")
         return group.start(
-            name, "-m", "vinesim", "client", "--role", "robot", "--name", name, "--spawn", str(i), *common, *options
+            name, "-m", "vinesim", "client", "--role", "robot", "--name", name, *place, *common, *options
         )
 
     def read(self) -> None:

@@ -27,7 +27,7 @@ from vinesim.audio.hearing import SpectatorsSpeakTo
 from vinesim.core.errors import UsageError
 from vinesim.net.codec.header import MAX_MESSAGE, is_valid_name
 from vinesim.net.transport.access_control import tls_config
-from vinesim.net.transport.bus import KEEP_ALL, KEEP_LAST_1, NameTaken, Reply, SampleStore
+from vinesim.net.transport.bus import KEEP_ALL, KEEP_LAST_1, NameTaken, Reply, SampleStore, SenderBudget
 from vinesim.net.transport.endpoints import PORT, Endpoint, client_links
 from vinesim.net.transport.name_holders import NameHolders, bound_name
 from vinesim.net.transport.signatures import Identity, SealCheck, Sealer
@@ -136,6 +136,7 @@ class ZenohBus:
         self._put_count = self._put_bytes = self._sent_count = self._sent_bytes = 0
         self._prefix = f"{ROOT}/{world}/"
         self._store = SampleStore()
+        self._budget = SenderBudget()
         self._replies: collections.deque[tuple[str, bytes, float]] = collections.deque()
         self._names = NameHolders(frozenset((name,) if live else ()))
         self._lost_endpoints: set[str] = set()
@@ -473,7 +474,7 @@ class ZenohBus:
 
     @property
     def dropped(self) -> int:
-        return self._store.overflowed + self._oversized
+        return self._store.overflowed + self._oversized + self._budget.dropped
 
     @property
     def status_message(self) -> str:
@@ -519,9 +520,13 @@ class ZenohBus:
             key = str(sample.key_expr)[skip:]
             if size > MAX_MESSAGE:
                 self._oversized += 1
+            elif self.is_secured and not self._budget.admits(bound_name(key), time.monotonic()):
+                pass  # counted by the budget; the router has checked the name
             else:
                 payload = sample.payload.to_bytes()
-                if not self._is_foreign(key, payload, None if source is None else source.source_id, seal, once=True):
+                if self._is_foreign(key, payload, None if source is None else source.source_id, seal, once=True):
+                    pass
+                elif self.is_secured or self._budget.admits(bound_name(key), time.monotonic()):
                     self._store.put(depth, key, payload)
             self.bytes_in += size
             self.seal_bytes_in += 0 if seal is None else len(seal)
