@@ -109,6 +109,19 @@ def _soak(
     return _call("soak:soak")(cast, minutes, record, _announce)
 
 
+def _joins(joins: int) -> Iterator[Measurement]:
+    if joins < 1:
+        raise UsageError(f"--joins is {joins}: give 1 or more")
+    return _call("joins:joins")(joins, _announce)
+
+
+def _starvation(times: int, seed: int) -> Iterator[Measurement]:
+    for option, value, least in (("times", times, 1), ("seed", seed, 0)):
+        if value < least:
+            raise UsageError(f"--{option} is {value}: give {least} or more")
+    return _call("starvation:starvation")(times, seed, _announce)
+
+
 def _hostile_actor(minutes: float, seed: int) -> Iterator[Measurement]:
     if minutes <= 0.0:
         raise UsageError(f"--minutes is {minutes:g}: give more than 0")
@@ -247,6 +260,19 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
         {
             "minutes": {"type": float, "default": 10.0, "help": "time under attack"},
             "seed": {"type": int, "default": 0, "help": "seed of the broken messages"},
+        },
+    ),
+    "joins": (
+        _joins,
+        "memory of a server and of a client while people join and leave (Linux)",
+        {"joins": {"type": int, "default": 3000, "help": "number of people"}},
+    ),
+    "starvation": (
+        _starvation,
+        "clients and servers that get no processor time for a while: time until all are served (Linux)",
+        {
+            "times": {"type": int, "default": 100, "help": "number of times"},
+            "seed": {"type": int, "default": 0, "help": "seed of the durations"},
         },
     ),
     "soak": (
