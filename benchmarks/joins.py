@@ -82,4 +82,4 @@ def _wait(world: SmallWorld, others: int, people: list[FakeClient]) -> None:
             one.tick(time.monotonic())
         if time.monotonic() > start + TIMEOUT:
             raise ProgramFailed(f"the resident client does not see {others} others after {TIMEOUT:.0f} s")
-        time.sleep(0.05)
+        time.sleep(0.1)

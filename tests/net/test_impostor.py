@@ -205,3 +205,16 @@ def test_a_reply_of_an_impostor_is_not_accepted_as_a_greeting(server: Server) ->
         wait(ask, "both answers")
         assert set(answers) == {hello("ada")}
         queryable.undeclare()
+
+
+def test_what_comes_before_the_key_of_its_session_is_dropped_and_no_fault(server: Server) -> None:
+    """Bob comes between two poses of ada that contain her key: he sees her within two seconds, and suspects nobody."""
+    with ZenohBus("ada", connect=server.endpoint) as ada, ZenohBus("cleo", connect=server.endpoint) as cleo:
+        ada.join(hello("ada"))
+        cleo.subscribe("a/*")
+        pose = ada.publisher("a/ada")
+        wait(lambda: pose.put(b"pose") and cleo.poll(), "cleo to hear ada")
+        with ZenohBus("bob", connect=server.endpoint) as bob:
+            bob.subscribe("a/*")
+            wait(lambda: pose.put(b"pose") and bob.poll(), "bob to hear ada")
+            assert bob.foreign == 0

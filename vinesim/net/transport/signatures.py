@@ -98,6 +98,11 @@ class SealCheck:
         self._last: dict[tuple[str, str], int] = {}
         """Number of the last message, by session and key."""
 
+    def is_early(self, session: str, seal: bytes | None) -> bool:
+        """Whether a seal cannot be checked yet, because it has no public key and its ``session`` has shown none: this
+        receiver has just come."""
+        return seal is not None and len(seal) == _SHORT and session not in self._sessions
+
     def is_from(self, session: str, key: str, payload: bytes, seal: bytes | None, *, once: bool = True) -> bool:
         """Whether a message was sealed by a ``session``, and is not older than another one under the same ``key``.
 

@@ -130,6 +130,9 @@ class ZenohBus:
         self.world = world
         self.endpoint = str(links.bulk)
         self.bytes_in = self.bytes_out = self._oversized = self.failures = self.foreign = 0
+        self.early = 0
+        """Number of messages that were dropped because their session had not shown its public key yet, as it does once
+        a second."""
         self.seal_bytes_in = self.seal_bytes_out = 0
         """Size of all seals that were received and sent [B], which :attr:`bytes_in` and :attr:`bytes_out` do not
         contain."""
@@ -457,6 +460,9 @@ class ZenohBus:
             is_own = source is not None and str(source.zid) == holder
         else:
             sealed = None if seal is None else seal.to_bytes()
+            if self._seals.is_early(holder, sealed):
+                self.early += 1
+                return True
             is_own = self._seals.is_from(holder, self._prefix + key, payload, sealed, once=once)
         if is_own:
             return False
