@@ -64,11 +64,11 @@ def _example_signals(runs: int, seed: int) -> Iterator[Measurement]:
     return _call("example_signals:example_signals")(runs, seed, _announce)
 
 
-def _fuzz(messages: int, false_messages: int) -> Iterator[Measurement]:
-    for option, value in (("messages", messages), ("false-messages", false_messages)):
+def _fuzz(messages: int, false_messages: int, seed: int) -> Iterator[Measurement]:
+    for option, value in (("messages", messages), ("false-messages", false_messages), ("seed", seed)):
         if value < 0:
             raise UsageError(f"--{option} is {value}: give 0 or more")
-    return _call("message_fuzz:fuzz")(messages, false_messages)
+    return _call("message_fuzz:fuzz")(messages, false_messages, seed)
 
 
 def _file_fuzz(files: int, seed: int, first: int, kinds: str) -> Iterator[Measurement]:
@@ -206,6 +206,7 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
                 "default": 0,
                 "help": "number of series of false messages (needs hypothesis)",
             },
+            "seed": {"type": int, "default": 0, "help": "seed; runs with different seeds are parts of a long one"},
         },
     ),
     "file_fuzz": (
