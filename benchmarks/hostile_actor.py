@@ -243,9 +243,11 @@ def _rows(
 ) -> Iterator[Measurement]:
     bench = "hostile actor"
     yield Measurement(
-        bench, "a step of the honest client in quiet times, mean", 1e3 * np.mean([q[0] for q in quiet]), "ms"
+        bench, "a step of the honest client in quiet times, mean", 1e3 * float(np.mean([q[0] for q in quiet])), "ms"
     )
-    yield Measurement(bench, "the server in quiet times, mean", 1e2 * np.mean([q[1] for q in quiet]), "% of a core")
+    yield Measurement(
+        bench, "the server in quiet times, mean", 1e2 * float(np.mean([q[1] for q in quiet])), "% of a core"
+    )
     for kind, found in costs.items():
         ratio = float(np.median([one[0] for one in found]))
         case = f"{kind}: a step of the honest client, times that in quiet times"

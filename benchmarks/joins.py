@@ -24,7 +24,7 @@ SETTLING = 300
 """Number of joins after which memory counts."""
 BUDGET = 5.0
 """Largest accepted growth of a process after :data:`SETTLING` joins [MB]."""
-TIMEOUT = 60.0
+TIMEOUT = 300.0
 """Longest time for a group to join or to leave [s]."""
 
 

@@ -1,5 +1,5 @@
-"""``python -m benchmarks soak``: five figures of robots, people and a recorder in a long run: the share of messages that
-were delivered, open files and threads, growth of memory, the recovery after a killed server, and the time to publish.
+"""``python -m benchmarks soak``: five figures of robots, people and a recorder in a long run: share of delivered
+messages, open files and threads, growth of memory, recovery after a killed server, and time to publish.
 
 All programs are processes on this machine, started as users start them: a server that keeps its state in a folder,
 robots whose sensors publish to ROS listeners, people who hold and pull bunches, and a recorder.
@@ -159,7 +159,8 @@ def run_soak(
 ) -> SoakResult:
     """Start all programs, wait until they are ready, sample them for ``minutes`` [min], and end them.
 
-    ``record`` is called with the result so far every :data:`RECORD_PERIOD`. Raises :class:`ProgramFailed` if a process ends too early, :class:`ProcUnavailable` on systems without /proc.
+    ``record`` is called with the result so far every :data:`RECORD_PERIOD`. Raises :class:`ProgramFailed` if a
+    process ends too early, :class:`ProcUnavailable` on systems without /proc.
     """
     check_proc()
     with own_processes() as group, tempfile.TemporaryDirectory() as folder:
