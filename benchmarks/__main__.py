@@ -33,19 +33,33 @@ def _asleep() -> Iterator[Measurement]:
     return _call("vineyard:sleeping_measurements")(load_description("vinebot").to_spec("robot"))
 
 
-def _picking(by: str, seeds: int, first: int, record: pathlib.Path | None) -> Iterator[Measurement]:
-    if seeds < 1:
-        raise UsageError(f"--seeds is {seeds}: give 1 or more")
-    if first < 0:
-        raise UsageError(f"--first is {first}: give 0 or more")
-    return _call("picking:picking")(by, range(first, first + seeds), record, _announce)
+def _picking(by: str, seeds: int, first: int, record: pathlib.Path | None, jobs: int) -> Iterator[Measurement]:
+    _require(("seeds", seeds, 1), ("first", first, 0), ("jobs", jobs, 1))
+    return _call("picking:picking")(by, range(first, first + seeds), record, jobs, _announce)
 
 
-def _pruning(seeds: int, first: int, spurs: int, record: pathlib.Path | None) -> Iterator[Measurement]:
-    for option, value, least in (("seeds", seeds, 1), ("first", first, 0), ("spurs", spurs, 0)):
+def _pruning(
+    by: str, seeds: int, first: int, spurs: int, record: pathlib.Path | None, jobs: int
+) -> Iterator[Measurement]:
+    _require(("seeds", seeds, 1), ("first", first, 0), ("spurs", spurs, 0), ("jobs", jobs, 1))
+    return _call("pruning:pruning")(by, range(first, first + seeds), spurs, record, jobs, _announce)
+
+
+def _require(*options: tuple[str, int, int]) -> None:
+    """Raise :class:`UsageError` for the first option, as name, value and least value, that is too small."""
+    for option, value, least in options:
         if value < least:
             raise UsageError(f"--{option} is {value}: give {least} or more")
-    return _call("pruning:pruning")(range(first, first + seeds), spurs, record, _announce)
+
+
+def _shared_harvest(scene: str, minutes: float, period: float, seed: int, replays: int) -> Iterator[Measurement]:
+    for option, value, least in (("seed", seed, 0), ("replays", replays, 0)):
+        if value < least:
+            raise UsageError(f"--{option} is {value}: give {least} or more")
+    for option, value in (("minutes", minutes), ("period", period)):
+        if not 0.0 < value < 1e4:
+            raise UsageError(f"--{option} is {value:g}: give more than 0, below 10000")
+    return _call("shared_harvest:shared_harvest")(scene, minutes, period, seed, replays, _announce)
 
 
 def _kill(times: int, seed: int) -> Iterator[Measurement]:
@@ -152,16 +166,30 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
             "seeds": {"type": int, "default": 1, "help": "number of vineyards"},
             "first": {"type": int, "default": 7, "help": "seed of the first vineyard"},
             "record": {"type": pathlib.Path, "help": "file of results by seed; seeds that it has are not run again"},
+            "jobs": {"type": int, "default": 1, "help": "number of processes, each with a seed at a time"},
         },
     ),
     "pruning": (
         _pruning,
         "prune a dormant vine by rule, in simulated time",
         {
+            "by": {"default": "truth", "choices": ["truth", "cameras"], "help": "what the robot knows of the plants"},
             "seeds": {"type": int, "default": 1, "help": "number of vineyards"},
             "first": {"type": int, "default": 1, "help": "seed of the first vineyard"},
             "spurs": {"type": int, "default": 0, "help": "largest number of spurs of each vine; 0: all"},
             "record": {"type": pathlib.Path, "help": "file of results by seed; seeds that it has are not run again"},
+            "jobs": {"type": int, "default": 1, "help": "number of processes, each with a seed at a time"},
+        },
+    ),
+    "shared_harvest": (
+        _shared_harvest,
+        "two clients prune, pick, tie and bend one vine, a third joins late: are all equal by hash, and a replay?",
+        {
+            "scene": {"default": "vsp", "help": "scene whose first vine is worked on"},
+            "minutes": {"type": float, "default": 10.0, "help": "simulated time of the work"},
+            "period": {"type": float, "default": 4.0, "help": "time between two pieces of work [s]"},
+            "seed": {"type": int, "default": 1, "help": "seed of the work and of the network"},
+            "replays": {"type": int, "default": 2, "help": "number of replays of the recording"},
         },
     ),
     "sensors": (
@@ -181,7 +209,7 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
     ),
     "coverage": (
         _coverage,
-        "share of fits whose 90 % interval contains the true value, for canes and bunches",
+        "share of fits whose 90 %% interval contains the true value, for canes and bunches",
         {
             "seeds": {"type": int, "default": 50, "help": "number of fits of each plant"},
             "first": {"type": int, "default": 0, "help": "first seed"},

@@ -25,7 +25,6 @@ import warp as wp
 
 from vinesim.bench import scenes
 from vinesim.bench.plants import plain_cane
-from vinesim.contact.resident_contacts import ResidentContacts
 from vinesim.core import frames
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import assemble
@@ -33,6 +32,7 @@ from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
 from vinesim.world import Physics
+from vinesim.worlds.batch_contacts import BatchContacts
 
 TICKS = 100
 PER_TREE = 17
@@ -100,14 +100,14 @@ def plants_on(device: str, count: int) -> ArticulationSolver:
     return plants
 
 
-def canes_on_bars(device: str, count: int) -> tuple[ArticulationSolver, ResidentContacts]:
+def canes_on_bars(device: str, count: int) -> tuple[ArticulationSolver, BatchContacts]:
     """Returns plants with ``count`` trees at one place, each a world of its own with a cane over the bars; and their
     contacts."""
     model = forest(count, 0.0, **bars())
     plants = ArticulationSolver(model, stirred(model), device=device)
     plants.wake(np.arange(count))
     plants.forward_kinematics()
-    return plants, ResidentContacts(plants, PhysicsParameters(solver_sweeps=SWEEPS))
+    return plants, BatchContacts(plants, PhysicsParameters(solver_sweeps=SWEEPS))
 
 
 def contact_trajectory(device: str) -> dict[str, np.ndarray]:

@@ -10,28 +10,29 @@ pictures are taken there without driving), finds bunches, chooses where to stand
 checks by the camera whether the bunch is in its hand. It knows its base and joints, its forces, and the trellis.
 Whether it has picked is counted by the truth.
 
-``--record FILE`` keeps a line of JSON for each seed, so that a long run can be continued.
+``--record FILE`` keeps a line of JSON for each seed, so that a long run can be continued. ``--jobs N`` runs seeds in N
+processes.
 """
 
 from __future__ import annotations
 
 import collections
 import dataclasses
-import json
 import math
 import pathlib
-import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
+from benchmarks.support.seed_runs import SeedRuns
 from vinesim.api.picking import ROBOT, Grasp, PickAttempt, attempt_pick
 from vinesim.api.sensors import look_at
 from vinesim.client.tasks import planning
 from vinesim.client.tasks.motions import LookAt
 from vinesim.client.tasks.seen_harvest import GAZE_DISTANCE, Memory, gaze_points, survey_places
 from vinesim.client.tasks.start_poses import bunch_centres, spawn_pose
+from vinesim.client.vine_events import fruit_report
 from vinesim.core import frames
 from vinesim.perception.robot_eyes import RobotEyes
 from vinesim.robot.description.loader import load_description
@@ -69,28 +70,13 @@ def class_name(clearance: float) -> str:
 
 
 def picking(
-    by: str, seeds: Sequence[int], record: pathlib.Path | None, announce: Callable[[str], None]
+    by: str, seeds: Sequence[int], record: pathlib.Path | None, jobs: int, announce: Callable[[str], None]
 ) -> Iterator[Measurement]:
-    """Measure success over all bunches in reach, by clearance; seconds of a pick; causes of failures; other bunches
-    that came off."""
-    known = {} if record is None or not record.exists() else _read(record)
-    lines = []
-    for seed in seeds:
-        line = known.get((by, seed))
-        if line is None:
-            start = time.monotonic()
-            line = {"by": by, "seed": seed} | (_by_truth(seed) if by == "truth" else _by_cameras(seed))
-            announce(f"seed {seed}: {_summary(line)}, {time.monotonic() - start:.0f} s")
-            if record is not None:
-                with record.open("a") as file:
-                    file.write(json.dumps(line) + "\n")
-        lines.append(line)
-    yield from all_measurements(lines)
-
-
-def _read(record: pathlib.Path) -> dict[tuple[str, int], dict[str, Any]]:
-    lines = [json.loads(line) for line in record.read_text().splitlines() if line]
-    return {(line["by"], line["seed"]): line for line in lines}
+    """Measure success over all bunches in reach, by clearance; seconds of a pick; berries; causes of failures; other
+    bunches that came off. ``jobs``: number of processes."""
+    work = _by_truth if by == "truth" else _by_cameras
+    runs = SeedRuns(work, {"benchmark": "picking", "by": by}, _summary, announce, record)
+    yield from all_measurements(runs.lines(seeds, jobs))
 
 
 def _summary(line: dict[str, Any]) -> str:
@@ -175,7 +161,18 @@ def attempt_seen(
     nearest = int(np.argmin(away)) if away.min() < 0.1 else -1
     picked = not task.is_done and len(held) > 0
     reason = task.reason or ("" if picked else "drive: the robot believes that it holds a bunch")
-    return PickAttempt(held[0] if held else nearest, clearance, picked, reason, len(off) - len(held), physics.time)
+    fruit = fruit_report(physics)
+    return PickAttempt(
+        held[0] if held else nearest,
+        clearance,
+        picked,
+        reason,
+        len(off) - len(held),
+        physics.time,
+        fruit["berries_burst"],
+        fruit["berries_lost"],
+        physics.fruit_monitor.history(held[0]).damage if picked else None,
+    )
 
 
 def _is_held(physics: Physics, bunch: int, tip: np.ndarray) -> bool:
@@ -232,6 +229,14 @@ def success_measurements(tries: list[PickAttempt]) -> Iterator[Measurement]:
     yield Measurement("picking", "the one a job would take", 100.0 * sum(one.picked for one in freest), "%")
     if seconds := [one.seconds for one in tries if one.picked]:
         yield Measurement("picking", "until the bunch is drawn back, median", float(np.median(seconds)), "s")
+    count = max(len(tries), 1)
+    lost = sum(one.berries_lost for one in tries)
+    burst = sum(one.berries_burst for one in tries)
+    yield Measurement("picking", "berries that fell off, of any bunch", lost / count, "berries/attempt")
+    yield Measurement("picking", "berries that burst, of any bunch", burst / count, "berries/attempt")
+    if damage := [100.0 * one.damage for one in tries if one.damage is not None]:
+        yield Measurement("picking", "damaged berries of a picked bunch, mean", float(np.mean(damage)), "%")
+        yield Measurement("picking", "damaged berries of a picked bunch, largest", max(damage), "%")
     for phase, count in collections.Counter(one.reason.split(":")[0] for one in tries if one.reason).most_common():
         yield Measurement("picking", f"failed in phase {phase}", float(count), "bunches")
     yield Measurement("picking", "other bunches that came off", float(sum(one.others for one in tries)), "bunches")

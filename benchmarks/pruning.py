@@ -1,23 +1,25 @@
 """``python -m benchmarks pruning``: prunes a dormant vine of scene ``winter_spur`` by rule, in simulated time.
 
-Each seed is a vineyard; the robot prunes the vine nearest to its start place, with poses of canes from the simulation.
+Each seed is a vineyard; the robot prunes the vine nearest to its start place, with poses of canes from the simulation
+(``--by cameras``: :mod:`benchmarks.seen_pruning`).
 Measured are the cuts that were made, their distance from the wanted places, other canes that were cut, the largest
 force on a bud of the kept spurs, and the seconds. ``--record FILE`` keeps a line of JSON for each seed, so that a long
-run can be continued.
+run can be continued. ``--jobs N`` runs seeds in N processes.
 """
 
 from __future__ import annotations
 
 import collections
-import json
+import functools
 import math
 import pathlib
-import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
+from benchmarks.seen_pruning import prune_seen, seen_measurements
+from benchmarks.support.seed_runs import SeedRuns
 from vinesim.api.picking import ROBOT
 from vinesim.client.tasks.pruning import PruningRule, plan_pruning
 from vinesim.client.tasks.start_poses import spawn_pose
@@ -39,24 +41,24 @@ LARGEST_FORCE = 5.0
 
 
 def pruning(
-    seeds: Sequence[int], spurs: int, record: pathlib.Path | None, announce: Callable[[str], None]
+    by: str,
+    seeds: Sequence[int],
+    spurs: int,
+    record: pathlib.Path | None,
+    jobs: int,
+    announce: Callable[[str], None],
 ) -> Iterator[Measurement]:
-    """Measure cuts, kept canes and buds, and seconds. ``spurs``: largest number of spurs of each vine, 0: all."""
-    known = {}
-    if record is not None and record.exists():
-        known = {one["seed"]: one for one in map(json.loads, record.read_text().splitlines()) if one["spurs"] == spurs}
-    lines = []
-    for seed in seeds:
-        line = known.get(seed)
-        if line is None:
-            start = time.monotonic()
-            line = prune_one(seed, spurs)
-            announce(f"seed {seed}: {line['right']} of {line['wanted']} cuts, {time.monotonic() - start:.0f} s")
-            if record is not None:
-                with record.open("a") as file:
-                    file.write(json.dumps(line) + "\n")
-        lines.append(line)
-    yield from measurements(lines)
+    """Measure cuts, kept canes and buds, and seconds. ``by``: what the robot knows of the plants, "truth" or "cameras".
+    ``spurs``: largest number of spurs of each vine, 0: all. ``jobs``: number of processes."""
+    work = functools.partial(prune_one if by == "truth" else prune_seen, spurs=spurs)
+    runs = SeedRuns(work, {"benchmark": "pruning", "by": by, "spurs": spurs}, _summary, announce, record)
+    lines = runs.lines(seeds, jobs)
+    yield from measurements(lines) if by == "truth" else seen_measurements(lines)
+
+
+def _summary(line: dict[str, Any]) -> str:
+    done, planned = ("right", "wanted") if line["by"] == "truth" else ("made", "planned")
+    return f"{line[done]} of {line[planned]} cuts"
 
 
 def prune_one(seed: int, spurs: int) -> dict[str, Any]:
@@ -65,7 +67,7 @@ def prune_one(seed: int, spurs: int) -> dict[str, Any]:
     model = generate(scene)
     rule = PruningRule()
     stops = plan_pruning(model, spawn_pose(scene, 0)[:2], rule, spurs=spurs or None)
-    physics = Physics(model)
+    physics = Physics(model, parameters=scene.physics)
     robot = Robot(physics.rigid, load_description(ROBOT), "pruner", pose=stops[0].base_pose)
     robot.fit_cutters(physics)
     task = PruneCanes(physics, robot, stops)
@@ -82,8 +84,6 @@ def prune_one(seed: int, spurs: int) -> dict[str, Any]:
     kept = kept_buds(model, stops, rule.buds)
     wanted = {cut.cane for stop in stops for cut in stop.cuts}
     return {
-        "seed": seed,
-        "spurs": spurs,
         "wanted": len(task.results),
         "made": sum(one.done for one in task.results),
         "right": sum(one.done and one.off <= LARGEST_ERROR for one in task.results),

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from vinesim.api.picking import PickAttempt as PickAttempt
     from vinesim.api.picking import attempt_pick as attempt_pick
     from vinesim.api.picking import reachable_grasps as reachable_grasps
+    from vinesim.api.plant_work import Binding as Binding
     from vinesim.api.plant_work import Hold as Hold
     from vinesim.api.pusher import Pusher as Pusher
     from vinesim.api.recording import RecordedMessage as RecordedMessage
@@ -62,6 +63,7 @@ if TYPE_CHECKING:
     from vinesim.scene.wind import Wind as Wind
 
 _MODULES = {
+    "Binding": "api.plant_work",
     "Blade": "interaction.blades",
     "Box": "scene.surroundings",
     "Camera": "api.sensors",

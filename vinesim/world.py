@@ -14,10 +14,12 @@ import numpy as np
 from vinesim.contact.contact_solver import ContactSolver
 from vinesim.core import frames
 from vinesim.interaction.blades import Blade
+from vinesim.interaction.breaking import WireBreak
 from vinesim.interaction.detachment import DetachmentMonitor
 from vinesim.interaction.dormant_bunches import DormantBunches
 from vinesim.interaction.fruit_damage import FruitMonitor
 from vinesim.interaction.hand_grasp import GraspManager
+from vinesim.interaction.handwork import BoundTie, Handwork
 from vinesim.interaction.stalk import is_on_stalk
 from vinesim.interaction.support_tracking import SupportTracker
 from vinesim.plants.articulation_solver import ArticulationSolver
@@ -84,6 +86,8 @@ class Physics:
             self.rigid.use_compliant_wires(wires)
         self.contact_solver = ContactSolver(model, self.plants, self.rigid, wires)
         self.detachment_monitor = DetachmentMonitor(self.plants, self.rigid, self.contact_solver, p)
+        self.handwork = Handwork(self.plants, self.contact_solver, self.detachment_monitor.report_work)
+        """Ties that actors bind and open, and leaves that they take off."""
         self.grasp_manager = GraspManager(self.plants, self.rigid, self.contact_solver)
         self.fruit_monitor = FruitMonitor(self.plants, self.rigid, self.contact_solver)
         self.support_tracker = SupportTracker(self.rigid)
@@ -120,7 +124,8 @@ class Physics:
             ("wind: set the air velocity at trees near actors", self._set_wind),
             ("grasps: close and open hands, pull held plants", self.grasp_manager.begin_step),
             ("blades: hold the wood between closing edges", self._hold_wood),
-            ("rigid: predict velocities without plant contacts", self.rigid.predict),
+            ("handwork: pull canes to the wires to which actors tie them", self.handwork.update),
+            ("rigid: predict velocities without plant contacts", self._predict_rigid),
             ("contacts: wake trees near moving geoms", self.contact_solver.wake_near_trees),
             ("detail: refine bunches near actors", self._refine_bunches),
             ("elastic supports: balance wires and arms with awake trees, wake others", self._update_elastic_supports),
@@ -165,6 +170,11 @@ class Physics:
             observers = np.array([self.rigid.actor_position(name) for name in actors]), self.parameters.wind_radius
         self.wind_on_plants.update(self.wind, self.time + self.wind_time_offset, observers)
 
+    def _predict_rigid(self) -> None:
+        if self.elastic_supports.count:  # the wires that robots press on follow from the poses of the shoots now
+            self.update_kinematics()
+        self.rigid.predict()
+
     def _refine_bunches(self) -> None:
         coarsened = self.level_of_detail.update(self.contact_solver.near_trees)
         if len(coarsened):  # the bounding boxes of sleeping trees must follow their new shapes
@@ -197,6 +207,8 @@ class Physics:
     def _deflect_wires(self) -> None:
         self.contact_solver.report_wires()
         self.wires.end_step(self.rigid.mj_data.tree_asleep)
+        if self._detachment:
+            self.detachment_monitor.break_wires(self.elastic_supports)
 
     def _detach(self) -> None:
         self.detachments = self.detachment_monitor.update(check_load=self._detachment)
@@ -232,6 +244,11 @@ class Physics:
         return self.detachment_monitor.closings
 
     @property
+    def wire_breaks(self) -> tuple[WireBreak, ...]:
+        """Pieces of wire that broke in the last step, sorted."""
+        return self.detachment_monitor.wire_breaks
+
+    @property
     def contacts(self) -> tuple[Contact, ...]:
         """Contacts with plants in the last step, sorted by (tree, body, shape, geom), followed by one contact for each
         hand that held a plant, and for each piece of wood that a closing blade held."""
@@ -239,12 +256,13 @@ class Physics:
 
     @property
     def touched(self) -> tuple[tuple[int, str], ...]:
-        """Pairs (tree, actor) for each tree that the actor pressed or held in the last step, sorted."""
+        """Pairs (tree, actor) for each tree that the actor pressed, held or tied in the last step, sorted."""
         contacts = self.grasp_manager.contacts + self.detachment_monitor.grips.contacts
-        if not contacts:
+        tied = self.handwork.touched
+        if not contacts and not tied:
             return self.contact_solver.touched_trees
         held = ((int(self.model.body_tree[contact.body]), contact.actor) for contact in contacts)
-        return tuple(sorted({*self.contact_solver.touched_trees, *held}))
+        return tuple(sorted({*self.contact_solver.touched_trees, *held, *tied}))
 
     def update_kinematics(self) -> None:
         """Compute the body poses ``state.body_q`` at the end of the last step. Without this call, ``state.body_q``
@@ -281,6 +299,7 @@ class Physics:
             wind=self.wind_on_plants.state,
             wires=self.wire_shapes.poses(),
             stumps=self.plants.stumps.table,
+            leaf_off=self.state.leaf_off,
         )
 
     def visuals(self) -> tuple[RigidVisual, ...]:
@@ -377,29 +396,86 @@ class Physics:
         self.detachment_monitor.apply_remote_stump(stump, segment, at, floats=floats)
         self._body_q = None
 
-    def apply_remote_wood(self, tree: int, given: GivenWood) -> None:
-        """Let the wood and ties of a tree give as on the client that owned it. Joints that have given more here stay.
+    def tie(self, body: int, along: float, to: np.ndarray, actor: str = "") -> BoundTie:
+        """Tie a cane between steps; see :meth:`Handwork.bind`."""
+        return self.handwork.bind(body, along, to, actor)
 
-        Nothing happens if the tree has no such bodies or ties.
+    def take_leaves(self, leaves: np.ndarray, actor: str = "") -> int:
+        """Take leaves [k] off between steps; see :meth:`Handwork.take_leaves`."""
+        self._body_q = None
+        return self.handwork.take_leaves(leaves, actor)
+
+    def given_wood(self, tree: int) -> GivenWood:
+        """Returns how a tree has changed for good, besides cuts."""
+        model = self.model
+        state = self.state
+        bodies = model.bodies_of(tree)
+        joints = np.flatnonzero((state.joint_flow[bodies] > 0.0) & ~state.body_cut[bodies])
+        ties = np.flatnonzero(model.body_tree[model.tie_body] == tree)
+        gave = np.flatnonzero(state.tie_broken[ties] | (state.tie_flow[ties] > 0.0))
+        notched = np.flatnonzero(state.notch_depth[bodies] > 0.0)
+        bound = self.handwork.of_tree(tree)
+        return GivenWood(
+            joints,
+            state.joint_set[bodies.start + joints],
+            state.joint_flow[bodies.start + joints],
+            gave,
+            state.tie_slid[ties[gave]],
+            state.tie_flow[ties[gave]],
+            state.tie_broken[ties[gave]],
+            notched,
+            state.notch_at[bodies.start + notched],
+            state.notch_depth[bodies.start + notched],
+            np.array([tie.segment - bodies.start for tie in bound], int),
+            np.array([tie.steps for tie in bound], int),
+            np.array([tie.to for tie in bound], np.float32).reshape(-1, 3),
+            np.array([tie.is_open for tie in bound], bool),
+            np.flatnonzero(state.leaf_off[self._leaves_of(tree)]),
+        )
+
+    def _leaves_of(self, tree: int) -> np.ndarray:
+        """Returns the leaves [k] of a tree, sorted."""
+        return np.flatnonzero(self.model.body_tree[self.model.leaf_body] == tree)
+
+    def apply_remote_wood(self, tree: int, given: GivenWood) -> None:
+        """Change a tree as it has changed on other clients, for good and besides cuts. What has changed more here
+        stays.
+
+        Nothing happens if the tree has no such bodies, ties or leaves.
         """
         model = self.model
         state = self.state
         ties = np.flatnonzero(model.body_tree[model.tie_body] == tree)
-        if given.joints.max(initial=-1) >= model.tree_core[tree] or given.ties.max(initial=-1) >= len(ties):
+        leaves = self._leaves_of(tree)
+        core = np.concatenate([given.joints, given.notched, given.tied])
+        if (
+            core.max(initial=-1) >= model.tree_core[tree]
+            or given.ties.max(initial=-1) >= len(ties)
+            or given.bare.max(initial=-1) >= len(leaves)
+        ):
             return
-        bodies = int(model.tree_first[tree]) + given.joints
-        further = given.flows > state.joint_flow[bodies]
+        first = int(model.tree_first[tree])
+        bodies = first + given.joints
+        further = (given.flows > state.joint_flow[bodies]) & ~state.body_cut[bodies]
         bodies = bodies[further]
         if len(bodies):
             self.plants.set_set(bodies, given.turns[further])
             state.joint_flow[bodies] = given.flows[further]
             self.detachment_monitor.wood.read_state(bodies)
-        for tie, slid, broken in zip(ties[given.ties].tolist(), given.slid.tolist(), given.broken, strict=True):
-            if (way := slid - float(state.tie_slid[tie])) != 0.0:
-                self.plants.slide_tie(tie, way)
+        for tie, slid, way, broken in zip(
+            ties[given.ties].tolist(), given.slid.tolist(), given.slid_in_all.tolist(), given.broken, strict=True
+        ):
+            if way > state.tie_flow[tie]:
+                self.plants.slide_tie(tie, slid - float(state.tie_slid[tie]))
                 state.tie_slid[tie] = slid
+                state.tie_flow[tie] = way
             if broken and not state.tie_broken[tie]:
                 self.plants.break_tie(tie)
+        for segment, at, depth in zip(given.notched, given.notch_at, given.notch_depth, strict=True):
+            self.detachment_monitor.notch(first + int(segment), float(at), float(depth))
+        for segment, steps, to, is_open in zip(given.tied, given.tied_at, given.tied_to, given.opened, strict=True):
+            self.handwork.learn_tie(first + int(segment), int(steps), to, is_open=bool(is_open))
+        self.handwork.take_leaves(leaves[given.bare], is_remote=True)
         self._body_q = None
 
     def apply_remote_rest(self, trees: list[int], joint_q: list[np.ndarray]) -> None:

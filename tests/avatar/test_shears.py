@@ -133,7 +133,8 @@ def test_shears_in_a_hand_that_opens_early_leave_a_partial_cut_that_weakens_the_
     physics, body, eva = at_peduncle()
     assert eva.run(15, right_closed=True) == [], "30 of 32 mm: 2 mm deep in a peduncle of 4 mm"
     assert eva.run(5, right_closed=False) == []
-    ((segment, (_, depth)),) = physics.detachment_monitor.notches.items()
+    (segment,) = np.flatnonzero(physics.state.notch_depth).tolist()
+    depth = float(physics.state.notch_depth[segment])
     assert segment == body - 1
     assert depth == pytest.approx(0.5, abs=0.01)
     monitor = physics.detachment_monitor

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import functools
 
+import msgspec
 import numpy as np
 import pytest
 
 from vinesim.client.tasks import planning, start_poses
 from vinesim.client.tasks.harvesting import PLACES, Candidates, HarvestOptions, PickOrder
+from vinesim.client.tasks.registry import plan_task
 from vinesim.client.tasks.seen_harvest import Memory, survey_places
 from vinesim.core.errors import UsageError
 from vinesim.rigid.static_world import CRATE_WALL
@@ -68,6 +70,15 @@ def test_wrong_options_are_refused_in_a_line():
     with pytest.raises(UsageError, match=r"^bunches is -1; give the number to pick, or 0 for all$"):
         HarvestOptions.named(-1, "freest")
     assert HarvestOptions.named(0, "nearest").most == len(PLACES)
+
+
+@pytest.mark.parametrize("eyes", [None, lambda physics, robot: None])
+def test_a_vineyard_without_bunches_is_refused_in_a_line(eyes):
+    scene = load_scene("harvest")
+    bare = msgspec.structs.replace(scene, fruit=msgspec.structs.replace(scene.fruit, bunches=(0, 0)))
+    near = start_poses.spawn_pose(bare, 0)
+    with pytest.raises(start_poses.PlacementError, match=r"^this vineyard has no bunch to pick; raise fruit\.bunches"):
+        plan_task("pick", generate(bare), near, ALL, eyes)
 
 
 def seen(x: float, y: float, *, distance: float = 0.8, is_cut_off: bool = False) -> SeenBunch:

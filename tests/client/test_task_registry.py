@@ -11,6 +11,7 @@ from vinesim.client.tasks.harvesting import HarvestByTruth
 from vinesim.client.tasks.motions import DriveTo, LookAt
 from vinesim.client.tasks.registry import UnknownTask, plan_task
 from vinesim.client.tasks.ros_command_handler import MAX_LOGGED, RosCommandHandler
+from vinesim.client.vine_events import fruit_report
 from vinesim.core import frames
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.rigid.rigid_world import RigidWorld
@@ -70,6 +71,12 @@ def test_a_client_runs_the_pick_task():
     run_to_the_end(client, task)
     assert task.report()["picked"] == task.report()["tried"] == 1
     assert task.report()["others_off"] == 0
+    fruit = fruit_report(client.physics)  # one attempt: its berries are all that were damaged
+    (row,) = task.report()["bunches"]
+    assert row["damage"] == round(client.physics.fruit_monitor.history(pick.plan.bunch).damage, 3)
+    assert row["berries_burst"] == pytest.approx(fruit["berries_burst"], abs=1e-3)
+    assert row["berries_lost"] == pytest.approx(fruit["berries_lost"], abs=1e-3)
+    assert task.report()["berries_lost"] == pytest.approx(fruit["berries_lost"], abs=1e-2)
     assert not client.physics.state.bunch_attached[pick.plan.bunch]
     local = frames.compose(frames.inverse(pick.box_pose), pick.bunch_pose)[:3]
     assert (np.abs(local[:2]) < 0.5 * client.physics.model.box_size[pick.plan.box, :2]).all()

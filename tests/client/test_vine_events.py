@@ -16,8 +16,9 @@ from vinesim.world import Physics
 def test_a_stalled_blade_is_an_event_with_its_reason():
     physics, blade, body = on_cane(force=500.0)
     close(physics, blade)
-    (row,) = json.loads(json.dumps(events_of(physics)))
+    row, notch = json.loads(json.dumps(events_of(physics)))
     assert (row["event"], row["outcome"], row["actor"], row["body"]) == ("blade", "stalled", "bar", body)
+    assert (notch["event"], notch["cause"], notch["actor"], notch["body"]) == ("notch", "blade", "bar", body)
     assert row["force_n"] == pytest.approx(500.0)
     assert row["needed_n"] == pytest.approx(1033.6, rel=1e-3)
     assert row["text"] == blade.outcome

@@ -10,6 +10,7 @@ from scipy.optimize import brentq
 from scipy.stats import kstest, weibull_min
 
 from vinesim import Simulation
+from vinesim.api.energy import momentum
 from vinesim.core import frames
 from vinesim.interaction.breaking import WoodMonitor
 from vinesim.plants.articulation_solver import ArticulationSolver
@@ -17,9 +18,11 @@ from vinesim.plants.device_buffers import DeviceBuffers
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.cane import CaneBuilder
 from vinesim.scene.cane import assemble as assemble_canes
+from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.scene.spec import load_scene
 from vinesim.scene.state import State
 from vinesim.scene.strength import peduncle_strength, weibull
 from vinesim.scene.surroundings import Tie, Wire
@@ -304,3 +307,76 @@ def test_ties_without_a_strength_hold():
     simulation, found = pull_top(tied_cane(), [0.6, 0.8, 0.0], 200.0, 1.0, 0.01)
     assert found == []
     assert not simulation.state.tie_broken.any()
+
+
+SCENES = ("demo", "vsp", "tendone", "cordon", "slope", "harvest")
+
+
+def pulled_body(physics: Physics, random: np.random.Generator, cane: bool) -> int:
+    """Returns a random body of a cane, or of a bunch that hangs, in a tree that stands."""
+    model = physics.model
+    state = physics.state
+    if cane:
+        fits = (model.body_organ == int(Organ.CANE)) & ~state.body_cut & (model.body_strength > 0.0)
+        return int(random.choice(np.flatnonzero(fits)))
+    return int(model.bunch_body[random.choice(np.flatnonzero(state.bunch_attached))])
+
+
+def break_at_random(scene: str, count: int, seed: int, at_once: int = 24) -> None:
+    """Pull canes and bunches of a scene at random, by forces in random directions that grow by 100 N/s, until ``count``
+    have broken. In each step with breaks: mass and momentum of the trees before and after the break."""
+    model = generate(load_scene(scene))
+    random = np.random.default_rng(seed)
+    physics = Physics(model)
+    plants = physics.plants
+    hooks: list[tuple[int, np.ndarray, int]] = []
+    breaks = 0
+    for step in range(40 * count):
+        hooks = [hook for hook in hooks if step - hook[2] < 200]
+        while len(hooks) < at_once:
+            body = pulled_body(physics, random, cane=random.random() < 0.7 or not physics.state.bunch_attached.any())
+            direction = random.normal(size=3)
+            hooks.append((body, direction / np.linalg.norm(direction), step))
+        plants.body_load[:] = 0.0
+        for body, direction, since in hooks:
+            plants.body_load[body, :3] = 1.0 * (step - since) * direction
+        plants.wake(np.unique(model.body_tree[[body for body, _, _ in hooks]]))
+        for name, stage in physics.stages:
+            if not name.startswith("detachment"):
+                stage()
+                continue
+            awake = plants.awake.copy()
+            plants.forward_kinematics(awake)
+            mass = plants.body_mass.copy()
+            was = momentum(plants, awake)
+            stage()
+            torn = physics.detachments
+            if torn and all(one.bunch < 0 for one in torn):
+                plants.forward_kinematics(awake)
+                here = np.concatenate([np.arange(*model.bodies_of(tree).indices(len(mass))) for tree in awake])
+                speed = np.abs(plants.state.body_qd[here]).max(1) * plants.body_mass[here]
+                is_now = momentum(plants, awake)
+                np.testing.assert_array_equal(plants.body_mass, mass)
+                assert np.abs(is_now.linear - was.linear).max() <= 2e-6 * speed.sum() + 1e-9, (step, torn)
+        physics.tick += 1
+        gone = {one.body for one in torn} | {int(model.bunch_body[one.bunch]) for one in torn if one.bunch >= 0}
+        breaks += len(torn)
+        hooks = [hook for hook in hooks if hook[0] not in gone and not physics.state.body_cut[hook[0]]]
+        if breaks >= count:
+            break
+    plants.body_load[:] = 0.0
+    for _ in range(50):
+        physics.step()
+    assert breaks >= count
+    assert np.isfinite(physics.snapshot().body_q).all()
+    assert {name: n for name, n in physics.faults.items() if n and name != "trees_slowed"} == {}
+
+
+def test_random_breaks_of_the_demo_keep_mass_and_momentum() -> None:
+    break_at_random("demo", 17, seed=5)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("scene", SCENES)
+def test_a_thousand_random_breaks_keep_mass_and_momentum(scene: str) -> None:
+    break_at_random(scene, 167, seed=11)

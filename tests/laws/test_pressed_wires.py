@@ -21,6 +21,7 @@ from tests.laws.test_wires import (
 from tests.laws.test_wires import ARM as SHOOT
 from tests.support.contact_scenes import cane, probe
 from tests.support.long_rows import each_once, long
+from vinesim.api.energy import energy
 from vinesim.core import frames
 from vinesim.rigid.mujoco_contacts import WIRE_MASS
 from vinesim.scene.builder import assemble
@@ -196,6 +197,32 @@ def test_what_presses_on_a_wire_moves_the_shoots_tied_to_it() -> None:
     np.testing.assert_allclose(
         np.linalg.inv(stiffness_of_ties(ALONG)), compliance(ALONG) + np.eye(4) / TIE, rtol=1e-9
     )  # the tests of this file and of test_wires.py mean the same wire
+
+
+def test_a_wire_bears_the_same_whether_or_not_its_world_is_looked_at() -> None:
+    """A rod that strikes a wire with four shoots, with and without a snapshot after each step: equal bits. The spring
+    of a wire follows from the poses of its shoots at the start of the step, not of the step before."""
+    worlds = [world(row_of_shoots(beyond=BEYOND)) for _ in range(2)]
+    for physics in worlds:
+        press(physics, 1.0, 20.0)
+    for _ in range(60):
+        for physics in worlds:
+            physics.step()
+        worlds[1].snapshot()
+        assert worlds[0].state.joint_qd.tobytes() == worlds[1].state.joint_qd.tobytes()
+        assert worlds[0].rigid.mj_data.qvel.tobytes() == worlds[1].rigid.mj_data.qvel.tobytes()
+    assert abs(tips(worlds[0])).max() > 1e-3
+
+
+def test_the_energy_of_a_pressed_wire_is_half_of_force_times_way() -> None:
+    """A rod that presses with 20 N beside four shoots, at rest: springs of shoots, ties and wire hold what a load of 20
+    N stores as it grows from nothing; the rod has moved by a dense solve's way."""
+    physics = world(row_of_shoots(beyond=BEYOND))
+    press(physics, 1.0, 20.0)
+    run(physics, 600)
+    physics.update_kinematics()
+    stored = energy(physics.plants, 0.0).total + physics.wires.energy
+    assert stored == pytest.approx(0.5 * 20.0 * (rod(physics) - (1.0 - THICK)), rel=0.01)
 
 
 def test_sleeping_shoots_wake_when_something_presses_on_their_wire() -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
+import itertools
 
 import msgspec
 import numpy as np
@@ -44,7 +46,7 @@ from vinesim.net.codec.messages import FAMILIES, MESSAGES, Counters, Traffic, sc
 from vinesim.net.codec.objects import ObjectStates, check_object_id, decode_objects, encode_objects
 from vinesim.net.codec.robot import MAX_JOINTS, decode_robot, encode_robot
 from vinesim.net.codec.trees import TreeStates, decode_trees, encode_trees, quantise_tree
-from vinesim.net.codec.wood import decode_wood, encode_wood
+from vinesim.net.codec.wood import decode_wood, encode_wood, joined_wood
 from vinesim.net.pace import PaceReport
 from vinesim.net.replication.authority import Claim
 from vinesim.scene import ids
@@ -455,16 +457,56 @@ def record(**change) -> RetainedRecord:
     return RetainedRecord(**{**usual, "pose": (1.0, 2.0, 0.1, 0.0, 0.6, 0.0, 0.8), "parent": "box/2", **change})
 
 
-def gave(turn: float = 1.0, flow: float = 0.2, slid: float = 0.1, places: tuple[int, int] = (3, 7)) -> GivenWood:
+def gave(
+    turn: float = 1.0,
+    flow: float = 0.2,
+    slid: float = 0.1,
+    depth: float = 0.5,
+    to: float = 1.5,
+    opened: bool = False,
+    leaves: tuple[int, ...] = (1, 4),
+    places: tuple[int, int] = (3, 7),
+) -> GivenWood:
     turns = np.array([[0.0, 0.6, 0.0, 0.8], [0.0, 0.0, 0.0, turn]], np.float32)
-    flows = np.array([0.1, flow], np.float32)
-    return GivenWood(np.array(places), turns, flows, np.array([2]), np.array([slid], np.float32), np.array([True]))
+    return GivenWood(
+        joints=np.array(places),
+        turns=turns,
+        flows=np.array([0.1, flow], np.float32),
+        ties=np.array([2]),
+        slid=np.array([slid], np.float32),
+        slid_in_all=np.array([abs(slid)], np.float32),
+        broken=np.array([True]),
+        notched=np.array([5]),
+        notch_at=np.array([0.01], np.float32),
+        notch_depth=np.array([depth], np.float32),
+        tied=np.array([4, 4]),
+        tied_at=np.array([200, 300]),
+        tied_to=np.array([[1.0, 2.0, to], [1.0, 2.1, 1.5]], np.float32),
+        opened=np.array([opened, True]),
+        bare=np.array(leaves),
+    )
+
+
+def test_states_of_one_tree_join_in_any_order():
+    """Nothing that was done on one client is lost, whichever record arrives first."""
+    one = encode_wood(gave(flow=0.3, slid=0.2, depth=0.4, leaves=(1, 4)))
+    two = encode_wood(gave(flow=0.2, slid=-0.3, depth=0.6, opened=True, leaves=(2,)))
+    three = encode_wood(gave(places=(2, 8), leaves=(9,)))
+    joined = decode_wood(joined_wood(one, two))
+    np.testing.assert_array_equal(joined.flows, np.array([0.1, 0.3], np.float32))
+    np.testing.assert_array_equal(joined.slid, np.array([-0.3], np.float32))
+    np.testing.assert_array_equal(joined.notch_depth, np.array([0.6], np.float32))
+    assert joined.opened.tolist() == [True, True]
+    assert joined.bare.tolist() == [1, 2, 4]
+    ends = {functools.reduce(joined_wood, order, b"") for order in itertools.permutations([one, two, three, one])}
+    assert len(ends) == 1
+    assert decode_wood(ends.pop()).joints.tolist() == [2, 3, 7, 8]
 
 
 def test_how_wood_has_given_is_decoded_to_the_bit():
     sent = gave()
     received = decode_wood(encode_wood(sent))
-    for name in ("joints", "turns", "flows", "ties", "slid", "broken"):
+    for name in (field.name for field in dataclasses.fields(GivenWood)):
         np.testing.assert_array_equal(getattr(received, name), getattr(sent, name))
     nothing = decode_wood(b"")
     assert encode_wood(nothing) == b""
@@ -500,12 +542,16 @@ def test_records_are_decoded_as_encoded():
         ({"stalk": (-1, 10)}, "impossible stalk"),
         ({"stalk": (5, 0)}, "impossible stalk"),
         ({"stalk": (5, 65536)}, "impossible stalk"),
-        ({"wood": b"\x01"}, "wood of 0 joints in 1 B"),
-        ({"wood": b"\x09\x00" + 22 * b"\x00"}, "wood of 9 joints in 24 B"),
+        ({"wood": b"\x01"}, r"wood of \[\] rows in 1 B"),
+        ({"wood": b"\x09\x00" + 22 * b"\x00"}, r"wood of \[9, 0, 0, 0, 0\] rows in 24 B"),
         ({"wood": encode_wood(gave(turn=0.5))}, "no rotation"),
         ({"wood": encode_wood(gave(flow=np.nan))}, "out of range"),
         ({"wood": encode_wood(gave(slid=np.inf))}, "out of range"),
+        ({"wood": encode_wood(gave(depth=1.5))}, "out of range"),
+        ({"wood": encode_wood(gave(to=np.nan))}, "out of range"),
         ({"wood": encode_wood(gave(places=(3, 3)))}, "does not increase"),
+        ({"wood": encode_wood(gave(leaves=(4, 1)))}, "does not increase"),
+        ({"fruit": (-1.0, 0.0)}, "impossible number of berries"),
         ({"parent": "x" * 201}, "impossible"),
     ],
 )

@@ -161,7 +161,9 @@ def test_a_weak_blade_stalls_at_the_depth_where_the_wood_takes_its_force(speed):
     assert event.energy == pytest.approx(law.shear_force(0.01) * 0.01 * float(law.energy_to_depth(depth)), rel=1e-4)
     assert "takes 1,034 N, the blades close with 500 N; they cut 0.6 of 10.0 mm" in event.sentence
     assert not physics.state.body_cut[body]
-    assert physics.detachment_monitor.notches[body][1] == pytest.approx(depth, rel=1e-4)
+    assert physics.state.notch_depth[body] == pytest.approx(depth, rel=1e-4)
+    (notch,) = physics.detachment_monitor.breakages
+    assert (notch.kind, notch.cause, notch.body) == ("notch", "blade", body)
 
 
 def test_a_second_closing_continues_the_cut_of_the_first():
@@ -182,7 +184,6 @@ def test_a_second_closing_continues_the_cut_of_the_first():
         law.cutting_energy(0.01) - law.shear_force(0.01) * 0.01 * float(law.energy_to_depth(0.7)), rel=0.01
     )
     assert physics.state.body_cut[body]
-    assert body not in physics.detachment_monitor.notches
 
 
 def test_a_saw_takes_the_time_of_the_section():

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.physics.test_batch_contacts import canes, moving
 from tests.physics.test_delassus import assembled
-from tests.physics.test_resident_contacts import canes, moving
 from vinesim.core.warp_arrays import SharedArrays, share, zeros
 from vinesim.kernels.contact import tree_islands
 from vinesim.kernels.contact.friction_law import (
@@ -20,7 +20,7 @@ from vinesim.kernels.contact.friction_law import (
     project_into_cone,
     steps_of,
 )
-from vinesim.kernels.contact.tree_solver import TreeSearch, TreeSystem, solve_tree, update_velocities
+from vinesim.kernels.worlds.dense_solver import WorldSearch, WorldSystem, solve_tree, update_velocities
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.world import Physics
 
@@ -33,7 +33,7 @@ NEWTON_STEPS = wp.constant(6)
 
 
 @wp.kernel
-def solve_one_tree(count: int, tolerance: wp.float64, system: TreeSystem, search: TreeSearch):
+def solve_one_tree(count: int, tolerance: wp.float64, system: WorldSystem, search: WorldSearch):
     update_velocities(0, 1, 3 * count, system)
     _sweeps, _busy = solve_tree(0, 0, 1, count, MOST_SWEEPS, NEWTON_STEPS, tolerance, system, search)
 
@@ -47,9 +47,9 @@ def solve_as_in_a_batch(matrix: np.ndarray, free: np.ndarray, surface: np.ndarra
     rows = len(free)
     assert (matrix.astype(np.float32) == matrix).all()
     system = SharedArrays.zeros(
-        TreeSystem, rows, matrix=np.ascontiguousarray(matrix.T, np.float32), free=free, surface=surface
+        WorldSystem, rows, matrix=np.ascontiguousarray(matrix.T, np.float32), free=free, surface=surface
     )
-    search = SharedArrays.zeros(TreeSearch, rows, factor=np.zeros((rows, rows + 1)))
+    search = SharedArrays.zeros(WorldSearch, rows, factor=np.zeros((rows, rows + 1)))
     wp.launch(solve_one_tree, 1, [rows // 3, TOLERANCE, system.struct, search.struct], device="cpu")
     return system.impulse
 

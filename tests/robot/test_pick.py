@@ -11,13 +11,15 @@ import pytest
 
 from tests.support.contact_forces import pressed_on_ground
 from vinesim.client.tasks import planning, start_poses
+from vinesim.contact.plant_capsules import plant_capsules
 from vinesim.core import frames
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.drives.joint_servos import CommandError
-from vinesim.robot.tasks.pick import PickBunch, PickPlan
+from vinesim.robot.tasks.pick import PickBunch, PickPlan, stalk_length
 from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene as load_scene
 from vinesim.scene.spec import with_seed
@@ -57,6 +59,28 @@ def run(pick: PickBunch) -> PickBunch:
         pick.robot.control(pick.physics.time)
         pick.physics.step()
     return pick
+
+
+@pytest.mark.parametrize(("name", "seed"), [("demo", 3), ("harvest", 7)])
+def test_the_bars_of_the_cutter_pass_above_the_shoulders_of_every_bunch(name: str, seed: int):
+    """Shoulders: fruit 20 mm or more beside the stalk, as high as its collision shapes; a bar is 6 mm thick."""
+    model = generate(with_seed(load_scene(name), seed))
+    capsules = plant_capsules(model)
+    pose = model.forward_kinematics(model.joint_settled).astype(float)
+    fruit = np.flatnonzero((capsules.bunch >= 0) & (model.body_organ[capsules.body] == int(Organ.BUNCH)))
+    of = capsules.bunch[fruit]
+    radius = capsules.radius[fruit].astype(float)
+    points = [frames.pose(at[fruit].astype(float)) for at in (capsules.start, capsules.end)]
+    ends = [frames.compose(pose[capsules.body[fruit]], point)[:, :3] for point in points]
+    upper = frames.inverse(pose[model.bunch_body[of]])
+    depth = np.minimum(*(frames.compose(upper, frames.pose(end))[:, 0] for end in ends))
+    beside = 0.020
+    height = np.where(radius > beside, np.sqrt(np.maximum(radius**2 - beside**2, 0.0)) - depth, -np.inf)
+    sizes = zip(model.bunch_radius.tolist(), model.bunch_length.tolist(), strict=True)
+    stalk = np.array([stalk_length(*size) for size in sizes])
+    assert len(np.unique(of)) == len(stalk) > 50
+    assert (stalk[of] - height).min() > 0.003
+    assert stalk.max() < 0.025  # the shortest peduncle is 50 mm long
 
 
 @pytest.mark.long
@@ -110,7 +134,7 @@ def test_a_failed_cut_is_reported_with_the_reason(vinebot: RobotDescription, mon
     model, task = vineyard(7)
     physics = Physics(model)
     robot = picker(physics, vinebot, task.base_pose)
-    monkeypatch.setattr(robot, "command_cutter", lambda group: None)
+    monkeypatch.setattr(robot, "command_cutter", lambda group, force: None)
     pick = run(PickBunch(physics, robot, task))
     assert not pick.picked
     assert pick.reason.startswith("cut: the blades missed the stalk")

@@ -26,4 +26,4 @@ def test_a_new_state_is_the_rest_pose():
     assert not state.body_qd.any()
     assert not state.tree_awake.any()
     assert state.bunch_attached.all()
-    assert state.counts() == {"body": 11, "tree": 1, "bunch": 1, "tie": 0}
+    assert state.counts() == {"body": 11, "tree": 1, "bunch": 1, "tie": 0, "leaf": 0}

@@ -126,11 +126,14 @@ class TestDemo:
 
 
 @pytest.mark.long
-def test_ctrl_c_ends_all_processes_of_a_background_demo(tmp_path):
+@pytest.mark.parametrize("job", ["push", "pick"])
+def test_ctrl_c_ends_all_processes_of_a_background_demo(tmp_path, job):
+    """The summary of a task tells how far it came; a push that was not measured to its end has none."""
     out = tmp_path / "interrupted"
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell does for "vinesim demo &"; children inherit it
     try:
-        demo = subprocess.Popen([*DEMO, "--seconds", "60", "--out", str(out)], stderr=subprocess.PIPE, text=True)
+        options = ["--job", job, "--seconds", "60", "--out", str(out)]
+        demo = subprocess.Popen([*DEMO, *options], stderr=subprocess.PIPE, text=True)
     finally:
         signal.signal(signal.SIGINT, before)
     try:
@@ -148,4 +151,9 @@ def test_ctrl_c_ends_all_processes_of_a_background_demo(tmp_path):
     assert demo.returncode == 130
     assert "Traceback" not in rest
     assert children_of(str(out)) == []
-    assert not (out / "summary.json").exists()
+    assert (out / "summary.json").exists() == (job == "pick")
+    if job == "pick":
+        summary = json.loads((out / "summary.json").read_text())
+        assert summary["picked"] is False
+        assert summary["reason"].startswith("stopped at ")
+        assert summary["detail"]["attempts"] == 0

@@ -15,6 +15,7 @@ import numpy as np
 
 from vinesim.client.tasks import planning
 from vinesim.client.tasks.start_poses import start_pose
+from vinesim.client.vine_events import fruit_report
 from vinesim.core.errors import UsageError
 from vinesim.core.numbers import checked_number, is_whole
 from vinesim.robot.description.loader import load_description
@@ -60,6 +61,12 @@ class PickAttempt:
     """Number of other bunches that came off their vines."""
     seconds: float = 0.0
     """Simulated time from the first motion of the hand to the end [s]."""
+    berries_burst: float = 0.0
+    """Expected number of berries, of any bunch, whose skins burst."""
+    berries_lost: float = 0.0
+    """Expected number of berries, of any bunch, that fell off."""
+    damage: float | None = None
+    """Share of the berries of the bunch in the hand which burst or fell off; None unless one was picked."""
 
 
 def reachable_grasps(scene: Scene | str | pathlib.Path, spawn: int = 0, reach: float = 3.0) -> list[Grasp]:
@@ -95,4 +102,16 @@ def attempt_pick(scene: Scene | str | pathlib.Path | Model, grasp: Grasp) -> Pic
         physics.step()
     cut = ~physics.state.bunch_attached
     others = int(cut.sum() - cut[grasp.bunch])
-    return PickAttempt(grasp.bunch, grasp.clearance, not task.is_done, task.reason, others, physics.time)
+    picked = not task.is_done
+    fruit = fruit_report(physics)
+    return PickAttempt(
+        grasp.bunch,
+        grasp.clearance,
+        picked,
+        task.reason,
+        others,
+        physics.time,
+        fruit["berries_burst"],
+        fruit["berries_lost"],
+        physics.fruit_monitor.history(grasp.bunch).damage if picked else None,
+    )

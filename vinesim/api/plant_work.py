@@ -17,27 +17,14 @@ import numpy as np
 from vinesim.core import frames
 from vinesim.core.errors import UsageError
 from vinesim.core.numbers import as_numbers, checked_number
+from vinesim.interaction.handwork import GRIP_DAMPING, GRIP_STIFFNESS, BoundTie, Handwork
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.plants.ties import TieLimitError
-from vinesim.scene.ids import Organ
-from vinesim.scene.model import Model
-
-TIE_REACH = 0.12
-"""[m] Largest gap between a cane and a wire to which it is tied: as far as a person pulls a shoot while tying it.
-GUESSED."""
-GRIP_STIFFNESS = 2000.0
-"""[N/m] Stiffness of a hold or a new tie: that of ties in ``data/plants/vine.toml``."""
-GRIP_DAMPING = 20.0
-"""[N s/m] Damping of a hold or a new tie, as above."""
-_TIED_PLACES = 65
-"""Number of places of a body among which the one nearest to a wire is found."""
-PULL_SPEED = 0.1
-"""[m/s] Speed at which a new tie pulls a cane to its wire. GUESSED."""
 
 
 class Hold:
-    """A spring that holds a place of a plant at a point of the world, which can be moved: a hand, or a tie.
-    :meth:`vinesim.api.simulation.Simulation.hold` and ``tie`` make one."""
+    """A spring that holds a place of a plant at a point of the world, which can be moved, as a hand does.
+    :meth:`vinesim.api.simulation.Simulation.hold` makes one."""
 
     def __init__(self, plants: ArticulationSolver, body: int, along: float) -> None:
         self.body = body
@@ -125,30 +112,54 @@ class Hold:
             raise UsageError(f"body {self.body} was let go; hold it again")
 
 
-def tied_places(length: float) -> np.ndarray:
-    """Returns the places [k] m of a body of ``length`` [m] at which a tie may be bound."""
-    return np.linspace(0.0, length, _TIED_PLACES)
+class Binding:
+    """A tie that was bound: a spring that holds a place of a cane beside a wire. The tree may fall asleep with it.
+    :meth:`vinesim.api.simulation.Simulation.tie` makes one."""
 
+    def __init__(self, handwork: Handwork, tie: BoundTie) -> None:
+        self._handwork = handwork
+        self._tie = tie
 
-def place_at_wire(model: Model, places: np.ndarray, radius: float, reach: float) -> tuple[int, np.ndarray]:
-    """Find where a cane of ``radius`` [m] is nearest to a straight wire.
+    @property
+    def body(self) -> int:
+        """Body that is tied: index in the model. It is a stump after a cut beyond the tie."""
+        return self._tie.segment if self._tie.body < 0 else self._tie.body
 
-    Returns the index of the nearest of the points ``places`` [k, 3] m of its axis, and where this point [3] m is when
-    the cane touches the wire on the side on which it is. Raises :class:`UsageError` if no wire is nearer than ``reach``
-    [m].
-    """
-    wires = np.flatnonzero(model.fixed_organ == int(Organ.WIRE))
-    start = model.fixed_start[wires].astype(float)
-    way = model.fixed_end[wires].astype(float) - start
-    square = np.maximum((way * way).sum(1), 1e-12)
-    share = np.clip(((places[:, None] - start) * way).sum(2) / square, 0.0, 1.0)
-    off = places[:, None] - start - share[..., None] * way
-    gaps = np.linalg.norm(off, axis=2)
-    if not len(wires) or gaps.min() > reach:
-        nearest = f"the nearest is {gaps.min():.3f} m away" if len(wires) else "there is none"
-        middle = np.round(places[len(places) // 2], 3).tolist()
-        raise UsageError(f"no wire within {reach} m of {middle}; {nearest}; give to = [x, y, z]")
-    place, wire = (int(n) for n in np.unravel_index(np.argmin(gaps), gaps.shape))
-    gap = float(gaps[place, wire])
-    side = off[place, wire] / gap if gap > 1e-6 else np.array([0.0, 0.0, 1.0])
-    return place, places[place] + side * (radius + float(model.fixed_radius[wires[wire]].mean()) - gap)
+    @property
+    def along(self) -> float:
+        """[m] Place on the body's x axis."""
+        return self._tie.at
+
+    @property
+    def is_held(self) -> bool:
+        """Whether the tie holds the cane."""
+        return self._tie.body >= 0
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the tie has pulled the cane to the wire."""
+        return not self._tie.is_pulling
+
+    @property
+    def target(self) -> np.ndarray:
+        """[3] m, point of the world to which the tie pulls in the end."""
+        return self._tie.to.astype(float)
+
+    @property
+    def position(self) -> np.ndarray:
+        """[3] m, the tied place."""
+        plants = self._handwork.plants
+        plants.forward_kinematics(plants.model.body_tree[[self.body]])
+        pose = plants.state.body_q[self.body].astype(float)
+        return pose[:3] + frames.rotate(pose[3:], np.array([self.along, 0.0, 0.0]))
+
+    @property
+    def force(self) -> np.ndarray:
+        """[3] N on the plant, without damping, world axes; zero after :meth:`release`."""
+        if not self.is_held:
+            return np.zeros(3)
+        return GRIP_STIFFNESS * (self._handwork.plants.tie_anchor[self._tie.row].astype(float) - self.position)
+
+    def release(self) -> None:
+        """Open the tie; nothing happens if it was opened before."""
+        self._handwork.open(self._tie)

@@ -100,6 +100,12 @@ class Pusher:
         return np.sum(forces, 0) if forces else np.zeros(3)
 
     @property
+    def contact_force(self) -> np.ndarray:
+        """[3] N, sum of the forces of all contacts on the body in the last step, world axes: of plants, wires, crates
+        and everything else."""
+        return self._physics.rigid.joint_measurements(self.name)[3].copy()
+
+    @property
     def is_done(self) -> bool:
         """Whether the target has reached the end of its path. A body that is held back by plants stays behind it."""
         return self._physics.time >= self._times[-1] - 1e-9

@@ -10,6 +10,7 @@ Positions are in m, forces in N, in world axes (:mod:`vinesim.core.frames`).
 from __future__ import annotations
 
 import functools
+import math
 import numbers
 import pathlib
 import warnings
@@ -20,7 +21,7 @@ import msgspec
 import numpy as np
 
 from vinesim.api.energy import Energy, Momentum, energy, momentum
-from vinesim.api.plant_work import PULL_SPEED, TIE_REACH, Hold, place_at_wire, tied_places
+from vinesim.api.plant_work import Binding, Hold
 from vinesim.api.pusher import Pusher, checked_shape
 from vinesim.client.faults import FaultLog, occurred
 from vinesim.contact.bud_forces import bud_forces
@@ -29,6 +30,7 @@ from vinesim.core.errors import UsageError, checked_index
 from vinesim.core.numbers import as_numbers, checked_vector, is_number, is_whole
 from vinesim.interaction.blades import Blade
 from vinesim.interaction.cutting_force import BLADE_FACTORS
+from vinesim.interaction.handwork import nearest_place
 from vinesim.kernels.compilation import PHYSICS_PACKAGES, compile_kernels
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot
@@ -390,10 +392,8 @@ class Simulation:
 
     def untie(self, tie: int) -> None:
         """Open a tie of the model, so that it holds its cane no longer. ``tie``: index into ``model.tie_body``. A tie
-        that was opened before stays open. :meth:`Hold.release` opens ties of :meth:`tie`."""
-        tie = checked_index("tie", tie, len(self.model.tie_body), UsageError)
-        self.physics.plants.break_tie(tie)
-        self.wake(int(self.model.body_tree[self.model.tie_body[tie]]))
+        that was opened before stays open. :meth:`Binding.release` opens ties of :meth:`tie`."""
+        self.physics.handwork.untie(checked_index("tie", tie, len(self.model.tie_body), UsageError))
 
     def hold(self, body: int, along: float = 0.0) -> Hold:
         """Hold a cane or a bunch as a hand does, where it is now; see :class:`Hold`.
@@ -411,7 +411,7 @@ class Simulation:
         self.wake(int(self.model.body_tree[body]))
         return held
 
-    def tie(self, body: int, along: float | None = None, to: Sequence[float] | np.ndarray | None = None) -> Hold:
+    def tie(self, body: int, along: float | None = None, to: Sequence[float] | np.ndarray | None = None) -> Binding:
         """Tie a cane. The tie pulls its place to the wire within a second or two, and holds it there.
 
         Args:
@@ -421,22 +421,38 @@ class Simulation:
             to: [3] m, the point to which the place is tied; unless given, beside the nearest wire, which does not
                 yield to this tie.
 
-        The tree stays awake. As many bodies can be tied or held at once as the physics parameter ``max_held_bodies``
-        says. Raises :class:`UsageError` if no wire is near.
+        Raises :class:`UsageError` if no wire is near, the body is no cane, or it is tied in two places already.
         """
-        if to is not None:
-            to = checked_vector("to", to, "m", UsageError)
-            along = 0.0 if along is None else along
-        else:
-            pose = self.body_pose(body).astype(float)
-            places = tied_places(float(self.model.body_length[body])) if along is None else as_numbers([along])
-            points = pose[:3] + frames.rotate(pose[3:], places[:, None] * np.array([1.0, 0.0, 0.0]))
-            radius = float(self.model.body_radius[body].mean())
-            nearest, to = place_at_wire(self.model, points, radius, TIE_REACH)
-            along = float(places[nearest])
-        held = self.hold(body, along)
-        held.follow(to, PULL_SPEED)
-        return held
+        plants = self.physics.plants
+        body = self._body(body)
+        try:
+            if to is not None:
+                to = checked_vector("to", to, "m", UsageError)
+                along = float(plants.body_start[body]) if along is None else along
+            else:
+                along, to = nearest_place(plants, body, along)
+            if not is_number(along):
+                raise UsageError(f"along is {along!r}; give a number [m]")
+            tie = self.physics.tie(body, float(along), to)
+        except ValueError as bad:
+            raise UsageError(str(bad)) from None
+        self.wake(int(self.model.body_tree[body]))
+        return Binding(self.physics.handwork, tie)
+
+    def take_leaves(self, body: int, start: float = 0.0, end: float = math.inf) -> int:
+        """Take the leaves off a piece of a shoot. They have no mass and no area any more, and no sensor sees them.
+
+        Args:
+            body: index in the model of the segment.
+            start: distance from the body's origin [m] from which leaves are taken off,
+            end: and to which.
+
+        Returns the number of leaves taken off. Raises :class:`UsageError` if ``end`` is before ``start``.
+        """
+        body = self._body(body)
+        if not (is_number(start) and (is_number(end) or end == math.inf) and 0.0 <= start <= end):
+            raise UsageError(f"leaves from {start!r} to {end!r} m; give two distances, 0 or more, in this order")
+        return self.physics.take_leaves(self.physics.handwork.leaves_on(body, float(start), float(end)))
 
     def add_robot(
         self,

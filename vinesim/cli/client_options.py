@@ -142,7 +142,7 @@ class ClientOptions:
     see: Annotated[
         bool,
         OF_ROBOT,
-        typer.Option("--see", help="Robots, --job pick: find bunches by the robot's camera, not by the simulation."),
+        typer.Option("--see", help="Robots, --job pick, prune: find plants by the robot's camera, not the simulation."),
     ] = False
     walk: Annotated[
         tuple[float, float] | None,

@@ -16,7 +16,7 @@ from vinesim.client.processes.robot_processes import RobotProcesses
 from vinesim.client.recording.state_digest import StateDigest
 from vinesim.client.tasks.harvesting import HarvestOptions
 from vinesim.client.tasks.motions import DriveTo, LookAt
-from vinesim.client.tasks.registry import plan_task, validate_task_name
+from vinesim.client.tasks.registry import plan_task, validate_sight, validate_task_name
 from vinesim.client.tasks.start_poses import start_pose, validate_bunch
 from vinesim.core.errors import UsageError, writing
 from vinesim.net.transport.bus import Bus
@@ -25,7 +25,7 @@ from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.push import PushBunch
-from vinesim.robot.tasks.sight import Eyes
+from vinesim.robot.tasks.sight import RobotSight
 from vinesim.robot.tasks.task import Task
 from vinesim.ros.names import ros_name, ros_namespace
 from vinesim.scene.values import SensorMode, SensorPacing
@@ -35,6 +35,7 @@ from vinesim.world import Physics
 def run(options: ClientOptions) -> int:
     """Build the client from its options, step until the end, then write the requested files. Returns the exit code."""
     validate_task_name(options.job)
+    validate_sight(options.job, options.see)
     harvest = HarvestOptions.named(options.bunches, options.order)
     descriptions = [
         load_description(robot, srdf=options.srdf, xacro_args=options.xacro_args or (), base=options.base)
@@ -100,7 +101,7 @@ def run(options: ClientOptions) -> int:
     return 0
 
 
-def _eyes(session: ClientSession) -> Callable[[Physics, Robot], Eyes]:
+def _eyes(session: ClientSession) -> Callable[[Physics, Robot], RobotSight]:
     """Returns a function that makes the eyes of a robot; the picture is rendered between two steps."""
     from vinesim.perception.robot_eyes import RobotEyes
 

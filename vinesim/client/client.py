@@ -463,6 +463,7 @@ class Client:
                 stalk_of=objects.stalk_of,
                 stumps_of=objects.stumps_of,
                 wood_of=objects.wood_of,
+                fruit_of=objects.fruit_of,
             )
             for update in settled:
                 # All copies hold the quantised state of the last message, so this client takes it, too.
@@ -491,6 +492,7 @@ class Client:
                     pose_on_support=self.physics.support_tracker.pose_on_support,
                     stalk_of=self.objects.stalk_of,
                     wood_of=self.objects.wood_of,
+                    fruit_of=self.objects.fruit_of,
                 )
 
     def side_of(self, point: np.ndarray) -> str:

@@ -309,6 +309,10 @@ class ContactSolver:
         self.capsules.level[self.capsules.body == spare] = HIDDEN
         self.detection.forget_clearances()
 
+    def hide_leaves(self, capsules: np.ndarray) -> None:
+        """Remove the shapes ``capsules`` [k] of leaves that were taken off; -1 for a leaf without one."""
+        self.detection.remove_leaves(capsules[capsules >= 0])
+
     def ignore_overlaps(self, bunch: int, low: np.ndarray, high: np.ndarray) -> None:
         """Disable contacts of a picked bunch with the trees that it overlaps; see
         :meth:`ContactDetection.ignore_overlaps`."""

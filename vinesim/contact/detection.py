@@ -38,6 +38,9 @@ MIN_TREE_ROOM = 64
 """Smallest capacity [awake trees] of the candidate arrays. The arrays grow when more trees are awake."""
 _NO_TREES = np.zeros(0, np.intp)
 
+_NOWHERE = np.array([0.0, 0.0, 1e6], np.float32)
+"""[3] m, place in a body's frame that nothing touches."""
+
 
 class ContactDetection:
     """Finds the trees near actors, and the contacts of awake trees with rigid geoms, with each other and with
@@ -186,6 +189,11 @@ class ContactDetection:
         shapes.local_end[capsule] *= share
         shapes.extent[capsule] = length + shapes.radius[capsule]
         self.forget_clearances()
+
+    def remove_leaves(self, capsules: np.ndarray) -> None:
+        """Move the capsules [k] of leaves out of everybody's reach."""
+        shapes = self.arrays.capsules
+        shapes.local_start[capsules] = shapes.local_end[capsules] = _NOWHERE
 
     def divide(self, capsule: int, parts: list[tuple[int, float, float]]) -> None:
         """Divide the capsule of a piece of wood: each of ``parts`` is a capsule, which may be hidden, and the distances

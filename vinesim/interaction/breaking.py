@@ -29,6 +29,7 @@ TWIST = "twist"
 SLIP = "slip"
 UNTIE = "untie"
 CRACK = "crack"
+NOTCH = "notch"
 """Kinds of :class:`~vinesim.scene.values.Breakage`."""
 PATIENCE = 0.5
 """[s] Time for which the wood of a tree is watched after the tree was last pushed, held, blown or fast. DERIVED: longer
@@ -56,6 +57,19 @@ class Overload:
     """[s] Time from the break to the end of the step."""
     is_crack: bool = False
     """Whether the wood has only cracked."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class WireBreak:
+    """The event that a piece of wire broke between two posts. The ties on it hold nothing any more."""
+
+    tick: int
+    piece: int
+    """Index of the fixed piece."""
+    tension: float
+    """[N] Tension at which it broke."""
+    ties: tuple[int, ...]
+    """Ties that the wire held until then."""
 
 
 class WoodMonitor:
@@ -102,7 +116,10 @@ class WoodMonitor:
             model.body_toughness,
         )
         """[body] How the joints of canes give."""
-        self.work = np.zeros((len(model.body_mass), 2))
+        self._whole_law = self.law
+        self._section = np.ones((count := len(model.body_mass), 2))
+        """[body, 2] Shares of cross-section and section modulus that cuts in part have left of the canes' joints."""
+        self.work = np.zeros((count, 2))
         """[body, 2] J, work that the wood at each joint has taken up so far: for its set, and for its crack."""
         self.given: set[int] = set()
         """Trees whose wood or ties gave in the last step."""
@@ -292,6 +309,20 @@ class WoodMonitor:
             there = values.numpy()
             there[slots] = strength
             values.assign(there)
+
+    def notch_cane(self, body: int, area: float, modulus: float) -> None:
+        """Leave the wood at the joint of a cane, which is cut in part, the shares ``area`` [1] of its cross-section and
+        ``modulus`` [1] of its section modulus. 1 and 1: the wood is whole."""
+        model = self.plants.model
+        if model.body_strength[body] <= 0.0:
+            return
+        self._section[body] = area, modulus
+        self.law = self._whole_law.notched(self._section[:, 0], self._section[:, 1])
+        pull = self._strengths.pull.numpy()
+        whole = float(model.body_strength[body] * np.pi * model.body_radius[body, 0] ** 2)
+        pull[self.plants.buffers.slots[body]] = max(area, 1e-6) * whole
+        self._strengths.pull.assign(pull)
+        self.read_state(np.array([body]))
 
     def forget(self, bunch: int) -> None:
         """Forget the load on the peduncle of a bunch that was picked."""

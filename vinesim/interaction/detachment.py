@@ -16,7 +16,15 @@ from vinesim.contact.contact_solver import ContactSolver
 from vinesim.core import frames
 from vinesim.core.errors import checked_index
 from vinesim.interaction.blades import Blade, BladeGrips, WoodPiece
-from vinesim.interaction.breaking import CRACK, Overload, WoodMonitor, distance_from_base
+from vinesim.interaction.breaking import (
+    CRACK,
+    NOTCH,
+    UNTIE,
+    Overload,
+    WireBreak,
+    WoodMonitor,
+    distance_from_base,
+)
 from vinesim.interaction.cutting_force import KERF, remaining_strength, shear_force
 from vinesim.interaction.stalk import cut_place, leave_stump, model_pieces, stalk_below, with_settled_stalk, with_stalk
 from vinesim.plants.articulation_solver import ArticulationSolver
@@ -26,6 +34,7 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.spare_bodies import PLACE_STEP
 from vinesim.scene.values import BladeClosing, Breakage, Contact, Detachment
+from vinesim.wires.elastic_supports import ElasticSupports
 
 log = logging.getLogger(__name__)
 
@@ -56,9 +65,6 @@ class DetachmentMonitor:
         """Holds the wood between the edges of closing blades."""
         self.closings: tuple[BladeClosing, ...] = ()
         """Closings of blades that ended in the last step."""
-        self.notches: dict[int, tuple[float, float]] = {}
-        """Cuts that do not go through, by body: place [m] along the body, and depth as a share of the diameter there.
-        Only this client knows them."""
         self.hand_contacts: tuple[Contact, ...] = ()
         """Forces of hands that hold plants, as contacts. They are used to find the actor who pulled off a bunch. The
         caller writes them.
@@ -70,6 +76,8 @@ class DetachmentMonitor:
         """Finds the wood that breaks under its load."""
         self.breakages: tuple[Breakage, ...] = ()
         """What has given without parting in the last step."""
+        self.wire_breaks: tuple[WireBreak, ...] = ()
+        """Wires that broke in the last step, sorted by piece."""
         self._breakages: list[Breakage] = []
         self._detachments: list[Detachment] = []
 
@@ -80,9 +88,15 @@ class DetachmentMonitor:
         ``check_load``: whether overloaded peduncles break; if not, only cuts are made."""
         if check_load:
             self._detach_overloaded()
+        else:
+            self.wood.given = set()
         self.closings = ()
         if any(blade.closing for blade in self.blades):
             self._cut_with_blades()
+        for blade in self.blades:
+            if blade.pieces and not blade.closing:  # it was opened early
+                self._leave_notches(blade, blade.pieces)
+                blade.pieces = []
         self.breakages, self._breakages = tuple(self._breakages), []
         taken = tuple(sorted(self._detachments, key=lambda parting: parting.body))
         self._detachments = []
@@ -103,27 +117,64 @@ class DetachmentMonitor:
             body = int(model.tie_body[tie])
             self._record_breakage(kind, "pull", body, np.append(pull, np.zeros(3)), 0.0, tie)
 
+    def break_wires(self, supports: ElasticSupports) -> None:
+        """Let wires break whose tension has passed their strength, and free the ties on them. Call it before
+        :meth:`update`, after the wires have got the tension of the step."""
+        if self.wire_breaks:
+            self.wire_breaks = ()
+        for piece in supports.overloaded().tolist():
+            plants = self.plants
+            tension = float(supports.tension[piece])
+            ties = supports.break_wire(piece)
+            self.wire_breaks += (WireBreak(plants.tick, piece, tension, tuple(ties.tolist())),)
+            for tie in ties.tolist():
+                plants.break_tie(tie)
+                body = int(plants.ties.tie_body[tie])
+                plants.wake(int(plants.model.body_tree[body]))
+                self._record_breakage(UNTIE, "pull", body, np.zeros(6), 0.0, tie)
+
     def _part_cane(self, broken: Overload) -> None:
-        """Let a broken cane part at its joint, or report a crack."""
+        """Let a broken cane part at its joint, or at the cut in part that has weakened it, or report a crack."""
         plants = self.plants
         model = plants.model
         body = broken.body
         if not broken.is_crack:
             actor = self._hardest_pressing_actor(model.body_tree == model.body_tree[body])
             if not plants.state.body_cut[body]:
+                notched = self._notch_at_joint(body)
+                if notched >= 0:
+                    at = float(plants.state.notch_at[notched])
+                    if plants.stumps.spare_for(notched, at) >= 0:
+                        self._cut_cane(notched, broken.cause, actor, broken.wrench, at)
+                        return
                 self._cut_cane(body, broken.cause, actor, broken.wrench)
             return
         self._record_breakage(CRACK, broken.cause, body, broken.wrench, broken.late)
 
+    def report_work(self, kind: str, cause: str, body: int, at: float, actor: str, tie: int = -1) -> None:
+        """Record that an actor changed a plant for good without parting it: ``kind`` ``"notch"``, ``"tied"``,
+        ``"untied"`` or ``"leaves"``, ``at`` [m] along ``body``."""
+        self._record_breakage(kind, cause, body, np.zeros(6), 0.0, tie, actor, at)
+
     def _record_breakage(
-        self, kind: str, cause: str, body: int, wrench: np.ndarray, late: float, tie: int = -1
+        self,
+        kind: str,
+        cause: str,
+        body: int,
+        wrench: np.ndarray,
+        late: float,
+        tie: int = -1,
+        actor: str | None = None,
+        at: float = 0.0,
     ) -> None:
-        """Record that the wood at the joint of ``body`` or a ``tie`` of it gave without parting."""
+        """Record that the wood at the joint of ``body`` or a ``tie`` of it gave without parting, or what ``actor`` did
+        to it ``at`` [m] along ``body``."""
         plants = self.plants
         model = plants.model
-        along = np.zeros(3) if tie < 0 else model.tie_point[tie].astype(float)
+        along = np.array([at, 0.0, 0.0]) if tie < 0 else model.tie_point[tie].astype(float)
         pose = plants.state.body_q[body].astype(float)
-        actor = self._hardest_pressing_actor(model.body_tree == model.body_tree[body])
+        if actor is None:
+            actor = self._hardest_pressing_actor(model.body_tree == model.body_tree[body])
         self._breakages.append(
             Breakage(
                 kind,
@@ -163,8 +214,8 @@ class DetachmentMonitor:
         goal = max(blade.gap - blade.speed * self.plants.dt, min(thickness, blade.gap), 0.0)
         stalled = blade.advance(goal, self.plants.dt, self._parameters.cutting_energy_share)
         for piece in blade.pieces:
-            if piece.depth > piece.kept:
-                self._notch(piece)
+            if piece.bunch >= 0 and piece.depth > piece.kept:
+                self.wood.weaken(piece.bunch, *remaining_strength(piece.depth))
         is_blocked = not stalled and thickness >= blade.gap > 0.0
         if blade.gap > 0.0 and not stalled and not is_blocked:
             return []
@@ -194,9 +245,8 @@ class DetachmentMonitor:
         self.closings += (event,)
         if blade.stalled:
             log.warning("%s of %s %s", blade.link, blade.actor, blade.outcome)
+            self._leave_notches(blade, pieces)
             return []
-        for piece in pieces:
-            self.notches.pop(piece.segment, None)
         return [one for one in pieces if one.bunch >= 0 or self.plants.state.body_cut[one.body] == one.floats]
 
     def _find_pieces(self, blade: Blade) -> None:
@@ -211,6 +261,7 @@ class DetachmentMonitor:
             and state.body_cut[piece.segment] == piece.floats
             and (piece.bunch < 0 or state.bunch_attached[piece.bunch])
         ]
+        self._leave_notches(blade, [piece for piece in blade.pieces if piece not in kept])
         known = {piece.body for piece in kept} | {int(parent[piece.body]) for piece in kept}
         for body in self._bodies_in_mouth(blade).tolist():
             bunch = int(self._bunch_of[body])
@@ -231,7 +282,8 @@ class DetachmentMonitor:
         radius = model.body_radius[whole].astype(float)
         length = float(model.body_length[whole])
         diameter = 2.0 * float(radius[0] + (radius[1] - radius[0]) * at / max(length, 1e-9))
-        notch = self.notches.get(segment)
+        depth = float(self.plants.state.notch_depth[whole])
+        apart = abs(float(self.plants.state.notch_at[whole]) - at)
         return WoodPiece(
             body=body,
             bunch=bunch,
@@ -239,20 +291,73 @@ class DetachmentMonitor:
             at=at,
             diameter=diameter,
             force=shear_force(diameter, self._strength(segment)),
-            kept=notch[1] if notch is not None and abs(notch[0] - at) <= KERF else 0.0,
+            kept=depth if apart <= KERF else 0.0,
             depth=0.0,
             floats=bool(self.plants.state.body_cut[segment]),
             point=self._in_mouth(blade, self._position(segment, at)),
         )
 
-    def _notch(self, piece: WoodPiece) -> None:
-        """Record how deep a piece of wood is cut, and weaken its peduncle."""
-        before = self.notches.get(piece.segment)
-        if before is not None and before[1] > piece.depth:
+    def _leave_notches(self, blade: Blade, pieces: list[WoodPiece]) -> None:
+        """Record the cuts that a blade has left in ``pieces`` of wood without going through."""
+        for piece in pieces:
+            segment = self.plants.stumps.segment_of(piece.segment)
+            if piece.depth > piece.kept and self.notch(segment, piece.at, piece.depth):
+                self.report_work(NOTCH, "blade", piece.segment, piece.at, blade.actor)
+
+    def notch(self, segment: int, at: float, depth: float) -> bool:
+        """Leave a cut ``at`` [m] along a segment of wood, as deep as the share ``depth`` of its diameter. It weakens
+        the peduncle or the nearest joint of the cane. A segment has one such cut, the deepest. Returns whether it is
+        this one."""
+        state = self.plants.state
+        held = float(state.notch_depth[segment]), float(state.notch_at[segment])
+        if (float(np.float32(depth)), float(np.float32(at))) <= held:
+            return False
+        state.notch_depth[segment] = depth
+        state.notch_at[segment] = at
+        self._weaken(segment)
+        return True
+
+    def _weaken(self, segment: int) -> None:
+        """Give the wood near a segment the strength that the cuts in part have left."""
+        depth = self.plants.state.notch_depth
+        bunch = int(self._bunch_of[segment])
+        if bunch >= 0:
+            self.wood.weaken(bunch, *remaining_strength(float(depth[self._bunch_of == bunch].max())))
             return
-        self.notches[piece.segment] = piece.at, piece.depth
-        if piece.bunch >= 0:
-            self.wood.weaken(piece.bunch, *remaining_strength(piece.depth))
+        for joint in (segment, self._continuation(segment)):
+            if joint >= 0:
+                notched = self._notch_at_joint(joint)
+                self.wood.notch_cane(joint, *remaining_strength(float(depth[notched]) if notched >= 0 else 0.0))
+
+    def _continuation(self, segment: int) -> int:
+        """Returns the body that continues a segment of a cane at its tip, the thickest one; -1 at the end of a cane."""
+        model = self.plants.model
+        is_cane = (model.body_organ == int(Organ.CANE)) & (model.body_offset[:, 0] > 0.5 * model.body_length[segment])
+        beyond = np.flatnonzero((model.body_parent == segment) & is_cane)
+        return int(beyond[np.argmax(model.body_radius[beyond, 0])]) if len(beyond) else -1
+
+    def _weak_joint(self, segment: int) -> int:
+        """Returns the body at whose joint the cut in part of a segment of cane weakens the wood: the nearer of both
+        ends of the segment. -1 if the segment has no such cut, or was parted there."""
+        plants = self.plants
+        at = float(plants.state.notch_at[segment])
+        length = float(plants.model.body_length[segment])
+        if plants.state.notch_depth[segment] <= 0.0:
+            return -1
+        ends = [start for body, start, _ in plants.stumps.parts_of(segment) if start > 0.0]
+        if any(abs(end - at) <= KERF for end in ends):
+            return -1
+        beyond = self._continuation(segment)
+        is_at_tip = at >= 0.5 * length and beyond >= 0
+        parted = [end for end in ends if (end > at if is_at_tip else end < at)]
+        return -1 if parted else beyond if is_at_tip else segment
+
+    def _notch_at_joint(self, joint: int) -> int:
+        """Returns the segment whose cut in part weakens the cane most at the joint of a body; -1 if none does."""
+        plants = self.plants
+        near = [int(body) for body in (joint, plants.model.body_parent[joint]) if body >= 0]
+        found = [body for body in near if self._weak_joint(body) == joint]
+        return max(found, key=lambda body: float(plants.state.notch_depth[body]), default=-1)
 
     def _obstacle(self, blade: Blade) -> tuple[str, float]:
         """Returns what the edges of a blade cannot cut, and its thickness [m] between them: a wire, post or old wood in
@@ -517,7 +622,9 @@ class DetachmentMonitor:
         stump = plants.cut(body, 0.0 if at is None else at)
         place = None
         if stump >= 0:
-            self.contact_solver.divide_wood(plants.stumps.segment_of(body))
+            segment = plants.stumps.segment_of(body)
+            self.contact_solver.divide_wood(segment)
+            self._forget_notch(segment)
             place = body, float(plants.state.stump_end[stump])
         self._record(body, -1, cause, actor, carried, place)
 
@@ -573,6 +680,12 @@ class DetachmentMonitor:
         if plants.stumps.can_leave(segment, at):
             plants.leave_stump(stump, segment, at, floats=floats)
             self.contact_solver.divide_wood(segment)
+            self._forget_notch(segment)
+
+    def _forget_notch(self, segment: int) -> None:
+        """After a cut through a segment: the wood that a cut in part has weakened may be gone."""
+        if self.plants.state.notch_depth[segment] > 0.0:
+            self._weaken(segment)
 
     def _record(
         self,

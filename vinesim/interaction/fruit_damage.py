@@ -86,6 +86,8 @@ class FruitMonitor:
         self.remote = np.zeros(count, bool)
         """[bunch] Whether another client moves the picked bunch, and records what happens to it. The client writes this
         array."""
+        self._told = np.zeros((count, 2))
+        """[bunch, 2] Numbers of burst and of lost berries that other clients have told."""
         self.events: tuple[FruitEvent, ...] = ()
         """Drops, burst and lost berries of the last step."""
         self._bunch_of = np.where(model.body_organ == int(Organ.BUNCH), model.bunch_of_body(), -1).astype(int)
@@ -187,9 +189,9 @@ class FruitMonitor:
         bunch = checked_index("bunch", bunch, len(self._row))
         berries = int(self.plants.model.bunch_berries[bunch])
         row = int(self._row[bunch])
+        burst, lost = self.berries_off(bunch) or (0.0, 0.0)
         if row < 0:
-            return BunchHistory(bunch, berries)
-        burst, lost = self._berries(np.array([row]))[0].tolist()
+            return BunchHistory(bunch, berries, berries_burst=burst, berries_lost=lost)
         worst = float(self._berry_force[row].max())
         return BunchHistory(
             bunch=bunch,
@@ -204,6 +206,20 @@ class FruitMonitor:
             berries_burst=burst,
             berries_lost=lost,
         )
+
+    def berries_off(self, bunch: int) -> tuple[float, float] | None:
+        """Returns the expected numbers of berries of a bunch that burst and that were lost, here or on another client,
+        of each the greater one. None if nothing happened to it."""
+        burst, lost = self._told[bunch].tolist()
+        row = int(self._row[bunch])
+        if row >= 0:
+            here = self._berries(np.array([row]))[0].tolist()
+            burst, lost = max(burst, here[0]), max(lost, here[1])
+        return (burst, lost) if burst > 0.0 or lost > 0.0 else None
+
+    def learn(self, bunch: int, burst: float, lost: float) -> None:
+        """Take over the numbers of burst and of lost berries of a bunch that another client has told."""
+        self._told[bunch] = np.maximum(self._told[bunch], (burst, lost))
 
     def handled(self) -> tuple[int, ...]:
         """Returns the bunches that actors touched or that fell, sorted."""

@@ -61,9 +61,6 @@ _KERNEL = re.compile(rb"^@wp\.kernel|_kernel\(__name__,", re.MULTILINE)
 """Regular expression that matches the definition of a kernel in a module's source."""
 _CUDA_ONLY = (
     "plants.lean_prediction",
-    "contact.tree_delassus",
-    "contact.tree_islands",
-    "contact.tree_narrowphase",
     "raster.cuda_raster",
 )
 _CPU_ONLY = (

@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import dataclasses
 import threading
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
 
 import warp as wp
 
@@ -37,6 +37,25 @@ _capturing = threading.Lock()
 
 No other thread may call ``wp.launch`` during a capture, because that would write to a table of the captured graph.
 """
+
+
+class Launchable(Protocol):
+    """What a graph can consist of."""
+
+    def launch(self, items: int, device: wp.Device) -> None:
+        """Launch kernels with enough threads for ``items`` items."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ForeignLaunches:
+    """Launches by a function of another library, which has no items."""
+
+    function: Callable[[], object]
+
+    def launch(self, items: int, device: wp.Device) -> None:
+        """Call the function, with ``device`` as Warp's device."""
+        with wp.ScopedDevice(device):
+            self.function()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +83,7 @@ class KernelLaunch:
 class KernelGraph:
     """A sequence of kernel launches that one call runs in order, as a captured Warp graph."""
 
-    def __init__(self, *launches: KernelLaunch, device: str = "cpu") -> None:
+    def __init__(self, *launches: Launchable, device: str = "cpu") -> None:
         self._launches = launches
         self._device = wp.get_device(device)
         self._is_cuda = self._device.is_cuda

@@ -1,4 +1,5 @@
-"""The eyes of a robot in its own process: its head camera, rendered between two steps, and the detector of bunches.
+"""The eyes of a robot in its own process: its head camera, rendered between two steps, and the detectors of bunches and
+canes.
 
 eyes = RobotEyes(physics, robot)
 for seen in eyes().bunches:
@@ -11,8 +12,9 @@ import numpy as np
 
 from vinesim.core.errors import UsageError
 from vinesim.perception.bunch_detection import find_bunches
+from vinesim.perception.cane_detection import find_canes
 from vinesim.robot.drives.controlled_robot import Robot
-from vinesim.robot.tasks.sight import Sight
+from vinesim.robot.tasks.sight import CaneSight, RowMap, Sight
 from vinesim.scene.values import CameraFrame, CameraMount, CameraOutput
 from vinesim.sensors.camera import camera as rgbd
 from vinesim.sensors.camera.sunlight import DEFAULT_SUN
@@ -75,3 +77,7 @@ class RobotEyes:
     def __call__(self, pose: np.ndarray | None = None) -> Sight:
         """Returns what the camera shows."""
         return find_bunches(self.picture(pose))
+
+    def canes(self, row: RowMap) -> CaneSight:
+        """Returns the canes that the camera shows."""
+        return find_canes(self.picture(), row)

@@ -55,7 +55,15 @@ from vinesim.kernels.plants.tree_checks import find_fastest
 from vinesim.kernels.plants.wood_stress import WoodStrength, find_stress
 from vinesim.plants.contact_loads import ContactLoads
 from vinesim.plants.device_buffers import DeviceBuffers
-from vinesim.plants.segment_parts import Part, joint_compliance, part_of, place_between, relaxed_joint
+from vinesim.plants.segment_parts import (
+    Part,
+    grows_between,
+    joint_compliance,
+    part_of,
+    place_between,
+    relaxed_joint,
+    without_leaves,
+)
 from vinesim.plants.ties import RootRests, TieTable, turning_damping
 from vinesim.plants.validation import checked_trees, validate
 from vinesim.scene.ids import Organ
@@ -282,6 +290,8 @@ class ArticulationSolver:
         self._rest = model.body_rest.copy()
         if len(bent := np.flatnonzero((state.joint_set[:, :3] != 0.0).any(1))):
             self._rest[bent] = frames.normalize(frames.multiply(model.body_rest[bent], state.joint_set[bent]))
+        self._grown_rest = model.body_rest.copy()
+        """[body, 4] Rest rotation of each joint without its set (``State.joint_set``)."""
         self._falls = np.zeros(bodies, np.bool_)  # whether no tie holds the body's floating component
         self._floating, self._divided_floating = (np.zeros(bodies, np.int32) for _ in range(2))
         self._falling_roots = np.zeros(0, np.int32)
@@ -499,6 +509,7 @@ class ArticulationSolver:
             state.joint_qd[body] = state.body_qd[body, 3:]
             state.body_cut[body] = True
             state.joint_set[body] = frames.IDENTITY
+            state.joint_flow[body] = 0.0
 
     def _detach_joints(self, bodies: np.ndarray) -> None:
         """Read from the state which bodies are cut off. ``bodies``: all bodies of some trees."""
@@ -551,10 +562,16 @@ class ArticulationSolver:
         before = state.joint_set[bodies].astype(float)
         turn = frames.multiply(frames.conjugate(kept), before)
         state.joint_set[bodies] = kept
-        self._rest[bodies] = frames.normalize(frames.multiply(self.model.body_rest[bodies].astype(float), kept))
+        self._rest[bodies] = frames.normalize(frames.multiply(self._grown_rest[bodies].astype(float), kept))
         state.joint_q[bodies] = frames.normalize(frames.multiply(turn, state.joint_q[bodies].astype(float)))
         state.joint_qd[bodies] = frames.rotate(turn, state.joint_qd[bodies].astype(float))
         self.buffers.upload(["body_rest"])
+
+    def _set_rest(self, body: int) -> None:
+        """Set the rest rotation of a joint from that of its wood and its set."""
+        kept = self.state.joint_set[body].astype(float)
+        grown = self._grown_rest[body].astype(float)
+        self._rest[body] = frames.normalize(frames.multiply(grown, kept)) if kept[:3].any() else grown
 
     def set_inertia(self, body: int, mass: float, com: np.ndarray, inertia: np.ndarray) -> None:
         """Set mass [kg], centre of mass [3] m and moments of inertia about it [3] kg m^2 of one piece of wood, in its
@@ -743,8 +760,9 @@ class ArticulationSolver:
         """Bodies that ties of :meth:`add_tie` hold."""
         return self.ties.held_bodies
 
-    def add_tie(self, body: int, point: np.ndarray, stiffness: float, damping: float) -> int:
+    def add_tie(self, body: int, point: np.ndarray, stiffness: float, damping: float, *, is_bound: bool = False) -> int:
         """Hold a body at ``point`` [3] m, in its own frame, by a spring [N/m] and damper [N s/m]; returns the tie.
+        ``is_bound``: the tie stays without a hand, so that the tree may fall asleep.
 
         The spring pulls the point to the tie's ``tie_anchor``, which starts at the point; callers may move it.
         Raises :class:`TieLimitError` if too many bodies are held, or this body in too many places, and
@@ -754,7 +772,8 @@ class ArticulationSolver:
         if body - self.model.tree_first[tree := self.model.body_tree[body]] >= self.model.tree_core[tree]:
             raise ValueError(f"body {body} is a berry cluster, which cannot be held; hold its bunch")
         self.forward_kinematics(np.array([tree]))
-        tie = self.ties.add(body, point, self.state.body_q[body].astype(float), stiffness, damping)
+        pose = self.state.body_q[body].astype(float)
+        tie = self.ties.add(body, point, pose, stiffness, damping, is_bound=is_bound)
         self._find_falling(self.bodies_of(np.array([tree])))
         return tie
 
@@ -767,6 +786,7 @@ class ArticulationSolver:
     def slide_tie(self, tie: int, way: float) -> None:
         """Move a tie of the model by ``way`` [m] along its wire (``State.tie_slid``)."""
         self.state.tie_slid[tie] += way
+        self.state.tie_flow[tie] += abs(way)
         self.ties.slide(tie, way * self.ties.axis[tie])
 
     def remove_tie(self, body: int, tie: int) -> None:
@@ -1117,11 +1137,10 @@ class Stumps:
         Raises :class:`ValueError` if the wood cannot be split there.
         """
         solver = self._solver
-        model = solver.model
         state = solver.state
         old, start, end = next(part for part in self.parts_of(segment) if part[1] < at < part[2])
-        before = part_of(model, segment, start, end)
-        parts = part_of(model, segment, start, at), part_of(model, segment, at, end)
+        before = self.part(segment, start, end)
+        parts = self.part(segment, start, at), self.part(segment, at, end)
         share = float(solver.body_mass[old]) / before.mass  # not 1 after set_mass
         share = 1.0 if abs(share - 1.0) < 1e-5 else share
         state.stump_of[spare] = segment
@@ -1140,6 +1159,9 @@ class Stumps:
             solver.joint_stiffness[spare] = solver.joint_stiffness[old]
             solver.joint_damping[spare] = solver.joint_damping[old]
             solver._rest[spare] = solver._rest[old]
+            solver._grown_rest[spare] = solver._grown_rest[old]
+            state.joint_set[spare] = state.joint_set[old]
+            state.joint_flow[spare] = state.joint_flow[old]
             self._compliance[spare] = self._compliance[old]
         for body, part in zip((spare, old), parts, strict=True):
             self._shape(body, part, share)
@@ -1163,8 +1185,8 @@ class Stumps:
         parts = self.parts_of(segment)
         number = next(i for i, part in enumerate(parts) if part[0] == spare)
         beyond, begin, end = parts[number + 1]
-        share = float(solver.body_mass[beyond]) / part_of(model, segment, begin, end).mass
-        self._shape(beyond, part_of(model, segment, parts[number][1], end), share)
+        share = float(solver.body_mass[beyond]) / self.part(segment, begin, end).mass
+        self._shape(beyond, self.part(segment, parts[number][1], end), share)
         state.stump_of[spare] = -1
         state.stump_end[spare] = 0.0
         state.body_cut[spare] = False
@@ -1175,6 +1197,9 @@ class Stumps:
             (state.joint_xd, 0.0),
             (solver._offset, 0.0),
             (solver._rest, frames.IDENTITY),
+            (solver._grown_rest, frames.IDENTITY),
+            (state.joint_set, frames.IDENTITY),
+            (state.joint_flow, 0.0),
             (solver.joint_settled, frames.IDENTITY),
             (solver.joint_stiffness, 0.0),
             (solver.joint_damping, 0.0),
@@ -1198,10 +1223,9 @@ class Stumps:
     def _restore(self, segment: int) -> None:
         """Set the parts of a segment from the state, which has their poses already."""
         solver = self._solver
-        model = solver.model
         parts = self.parts_of(segment)
         for body, start, end in parts:
-            self._shape(body, part_of(model, segment, start, end), 1.0)
+            self._shape(body, self.part(segment, start, end), 1.0)
         for body, _, end in parts[:-1]:
             self._attach(body, segment)
             self._take_joint(body, segment)
@@ -1210,12 +1234,29 @@ class Stumps:
         for joint, of in [(parts[0][0], segment), *self._joints_on(segment)]:
             self._adjust_joint(joint, of, turns=False)
 
+    def part(self, segment: int, start: float, end: float) -> Part:
+        """Returns the part of a segment's wood from ``start`` to ``end`` [m], with the leaves that are still on it."""
+        solver = self._solver
+        model = solver.model
+        whole = part_of(model, segment, start, end)
+        off = np.flatnonzero((model.leaf_body == segment) & solver.state.leaf_off)
+        here = off[grows_between(model, segment, off, start, end)]
+        return without_leaves(model, whole, here) if len(here) else whole
+
+    def shed(self, segment: int) -> None:
+        """Give the parts of a segment their masses after leaves were taken off (``State.leaf_off``)."""
+        solver = self._solver
+        for body, start, end in self.parts_of(segment):
+            self._shape(body, self.part(segment, start, end), 1.0)
+        solver.launches.changed = True
+
     def _take_joint(self, spare: int, segment: int) -> None:
         """Give a stump the joint of a segment of the model."""
         solver = self._solver
         solver.joint_stiffness[spare] = solver.model.joint_stiffness[segment]
         solver.joint_damping[spare] = solver.model.joint_damping[segment]
-        solver._rest[spare] = solver.model.body_rest[segment]
+        solver._grown_rest[spare] = solver.model.body_rest[segment]
+        solver._set_rest(spare)
         self._compliance[spare] = 1.0
 
     def _shape(self, body: int, part: Part, share: float) -> None:
@@ -1270,12 +1311,13 @@ class Stumps:
         self._compliance[body] = compliance
         solver.joint_stiffness[body] *= ratio
         solver.joint_damping[body] *= ratio
-        rest, solver.joint_settled[body] = relaxed_joint(model, segment, compliance)
+        solver._grown_rest[body], solver.joint_settled[body] = relaxed_joint(model, segment, compliance)
+        before = solver._rest[body].astype(float)
+        solver._set_rest(body)
         if turns:
-            turn = frames.multiply(frames.conjugate(rest), solver._rest[body].astype(float))
+            turn = frames.multiply(frames.conjugate(solver._rest[body].astype(float)), before)
             state.joint_q[body] = frames.normalize(frames.multiply(turn, state.joint_q[body].astype(float)))
             state.joint_qd[body] = frames.rotate(turn, state.joint_qd[body].astype(float))
-        solver._rest[body] = rest
 
 
 # Poses of trees that another client simulates.

@@ -83,12 +83,8 @@ def part_of(model: Model, segment: int, start: float, end: float) -> Part:
     whole = around + across.sum(0)
 
     share = (end - start) / length
-    grows = (start <= model.leaf_base[leaves, 0]) & (model.leaf_base[leaves, 0] < end)
+    grows = grows_between(model, segment, leaves, start, end)
     here = np.append(grows, start <= tip < end or (end >= length and tip == length))
-    if start <= 0.0:
-        here[:-1] |= model.leaf_base[leaves, 0] < 0.0
-    if end >= length:
-        here[:-1] |= model.leaf_base[leaves, 0] >= length
     own = points[here]
     x = places[here]
     total = share * rod + own.sum()
@@ -106,6 +102,32 @@ def part_of(model: Model, segment: int, start: float, end: float) -> Part:
         np.array([beside.sum(), along + beside[1], along + beside[0]]),
         share * bare + float(drag[here[:-1]].sum()),
     )
+
+
+def grows_between(model: Model, segment: int, leaves: np.ndarray, start: float, end: float) -> np.ndarray:
+    """Returns whether each of the ``leaves`` [k] of a segment grows on its part from ``start`` to ``end`` [m]."""
+    base = model.leaf_base[leaves, 0]
+    here = (start <= base) & (base < end)
+    if start <= 0.0:
+        here |= base < 0.0
+    if end >= float(model.body_length[segment]):
+        here |= base >= end
+    return here
+
+
+def without_leaves(model: Model, part: Part, leaves: np.ndarray) -> Part:
+    """Returns a part of a segment without ``leaves`` [k] of it: their masses, first and second moments and drag areas
+    are subtracted. Products of inertia are left out, as the generator of plants does."""
+    mass = model.leaf_mass[leaves].astype(float)
+    at = model.leaf_pose[leaves, :3].astype(float)
+    left = part.mass - mass.sum()
+    com = (part.mass * part.com - mass @ at) / left
+    xx, yy, zz = part.inertia
+    second = 0.5 * np.array([yy + zz - xx, zz + xx - yy, xx + yy - zz]) + part.mass * part.com**2
+    second = second - mass @ at**2 - left * com**2
+    second = np.maximum(second, 1e-3 * part.inertia.max() * left / part.mass)
+    inertia = second.sum() - second
+    return Part(left, com, inertia, max(part.drag - float(model.leaf_drag[leaves].sum()), 0.0))
 
 
 _CLAMPED = 2.0 * 3.0 / 1.875104**4

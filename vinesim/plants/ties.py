@@ -2,8 +2,8 @@
 Also the rest poses of root springs.
 
 The kernels need the ties of a body to be adjacent. So after the model's ties the arrays have spans of equal length for
-bodies that hands hold. Each held body gets one span: a copy of its model ties, followed by the ties of the hands that
-hold it.
+bodies that hands hold or that actors have tied. Each such body gets one span: a copy of its model ties, followed by the
+ties of the hands that hold it, and by the ties that actors have bound.
 """
 
 from __future__ import annotations
@@ -21,6 +21,12 @@ TURNING_TIME = 0.05
 damps its rotation. GUESSED: a damping ratio of 0.1 for a swing of 1.5 s."""
 
 
+MAX_BOUND_BODIES = 128
+"""Largest number of bodies that can have ties which actors have bound."""
+MAX_BOUND_TIES = 2
+"""Largest number of such ties on one body."""
+
+
 class TieLimitError(ValueError):
     """Raised if hands would hold too many plant bodies, or one body in too many places."""
 
@@ -36,6 +42,7 @@ class TieTable:
 
     def __init__(self, model: Model, max_bodies: int, max_hands: int) -> None:
         self._max_bodies = max_bodies
+        self._slots = max_bodies + MAX_BOUND_BODIES
         self._max_hands = max_hands
         self._model_ties = len(model.tie_body)
         self.tie_body = model.tie_body.copy()
@@ -46,8 +53,8 @@ class TieTable:
         """Number of cuts that have moved ties to stumps."""
         bodies = len(model.body_mass)
         self._max_model_ties = int(np.bincount(model.tie_body, minlength=bodies).max(initial=0))
-        self._span_size = self._max_model_ties + max_hands
-        room = max_bodies * self._span_size
+        self._span_size = self._max_model_ties + max_hands + MAX_BOUND_TIES
+        room = self._slots * self._span_size
         self.anchor = np.append(model.tie_anchor, np.zeros((room, 3), np.float32), 0)
         """[tie, 3] m, in the world: the fixed end of each tie."""
         self.anchor_velocity = np.zeros_like(self.anchor)
@@ -76,13 +83,14 @@ class TieTable:
         """Ties of the model that are bound to wires under tension [k], sorted."""
         self._model_span = self.span.copy()
         self._slot_of: dict[int, int] = {}
+        self._held: set[int] = set()
         self.on_slide: Callable[[int, np.ndarray], None] = lambda tie, way: None
         """Called with a tie of the model that slides and its way [3] m, by those who place its anchor."""
 
     @property
     def held_bodies(self) -> list[int]:
-        """Bodies that have ties of :meth:`add`."""
-        return list(self._slot_of)
+        """Bodies that have ties of :meth:`add` which are not bound."""
+        return sorted(self._held)
 
     def are_tied(self, bodies: np.ndarray) -> np.ndarray:
         """Returns whether each of the ``bodies`` [k] has ties that hold it."""
@@ -134,9 +142,18 @@ class TieTable:
         self.anchor[rows] += way.astype(np.float32)
         self.on_slide(tie, way)
 
-    def add(self, body: int, point: np.ndarray, pose: np.ndarray, stiffness: float, damping: float) -> int:
+    def add(
+        self,
+        body: int,
+        point: np.ndarray,
+        pose: np.ndarray,
+        stiffness: float,
+        damping: float,
+        *,
+        is_bound: bool = False,
+    ) -> int:
         """Tie the point ``point`` [3] m of a body's frame to its present place in the world. ``pose`` [7]: world pose
-        of the body. Returns the tie's index.
+        of the body. ``is_bound``: the tie stays without a hand. Returns the tie's index.
 
         Raises :class:`TieLimitError` if too many bodies are held, or this body in too many places.
         """
@@ -145,12 +162,17 @@ class TieTable:
                 f"tie of body {body} at {point}, stiffness {stiffness} N/m, damping {damping} N s/m; give a finite "
                 "point, a stiffness above 0 and a damping of 0 or more"
             )
+        if not is_bound and body not in self._held and len(self._held) == self._max_bodies:
+            raise TieLimitError(f"body {body} is one too many: {self._max_bodies} are held already, let go of one")
         if body not in self._slot_of:
             self._give_span(body)
-        start = self._hands_start(body)
-        spare = np.flatnonzero(self.stiffness[start : start + self._max_hands] == 0.0)
+        start, end = self._own_rows(body, is_bound=is_bound)
+        spare = np.flatnonzero(self.stiffness[start:end] == 0.0)
         if len(spare) == 0:
-            raise TieLimitError(f"body {body} is held in {self._max_hands} places already; let go of one")
+            verb = "tied" if is_bound else "held"
+            raise TieLimitError(f"body {body} is {verb} in {end - start} places already; let go of one")
+        if not is_bound:
+            self._held.add(body)
         tie = start + int(spare[0])
         self.anchor[tie] = pose[:3] + frames.rotate(pose[3:], np.asarray(point, float))
         self.point[tie] = point
@@ -161,18 +183,25 @@ class TieTable:
     def remove(self, body: int, tie: int) -> None:
         """Remove a tie that :meth:`add` added."""
         self.stiffness[tie] = self.damping[tie] = 0.0
-        start = self._hands_start(body)
-        if not self.stiffness[start : start + self._max_hands].any():
+        first, middle = self._own_rows(body, is_bound=False)
+        end = middle + MAX_BOUND_TIES
+        if not self.stiffness[first:middle].any():
+            self._held.discard(body)
+        if not self.stiffness[first:end].any():
             del self._slot_of[body]
             self.span[body] = self._model_span[body]
 
-    def _hands_start(self, body: int) -> int:
-        return self._model_ties + self._span_size * self._slot_of[body] + self._max_model_ties
+    def _own_rows(self, body: int, *, is_bound: bool) -> tuple[int, int]:
+        """Returns the first row of a body's ties of hands, or of its bound ties, and the row after the last."""
+        first = self._model_ties + self._span_size * self._slot_of[body] + self._max_model_ties
+        middle = first + self._max_hands
+        return (middle, middle + MAX_BOUND_TIES) if is_bound else (first, middle)
 
     def _give_span(self, body: int) -> None:
-        free = [i for i in range(self._max_bodies) if i not in self._slot_of.values()]
+        taken = set(self._slot_of.values())
+        free = [i for i in range(self._slots) if i not in taken]
         if not free:
-            raise TieLimitError(f"body {body} is one too many: {self._max_bodies} are held already, let go of one")
+            raise TieLimitError(f"body {body} is one too many: {MAX_BOUND_BODIES} are tied already, open a tie")
         self._slot_of[body] = free[0]
         start = self._model_ties + self._span_size * free[0]
         for values in self._rows():

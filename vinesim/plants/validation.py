@@ -199,4 +199,8 @@ def _validate_ties(model: Model) -> None:
     if (bad := ~((model.fixed_tension >= 0.0) & np.isfinite(model.fixed_tension))).any():
         piece = int(np.argmax(bad))
         raise ValueError(f"fixed piece {piece}: tension {model.fixed_tension[piece]} N; give 0 or more")
+    for values, name, unit in ((model.fixed_stretch, "stretch", "N/m"), (model.fixed_strength, "strength", "N")):
+        if (bad := ~((values >= 0.0) & np.isfinite(values))).any():
+            piece = int(np.argmax(bad))
+            raise ValueError(f"fixed piece {piece}: {name} {values[piece]} {unit}; give 0 or more")
     refuse(~(model.tie_damping >= 0.0), "damping below 0 N s/m; a damper takes energy: use 0 or more")

@@ -150,6 +150,10 @@ class Model(StructOfArrays):
     """Index of the pole, wire, trunk or arm that this piece belongs to."""
     fixed_tension: np.ndarray = array("fixed", unit="N")
     """Tension of a piece of wire between its ends; 0: it does not deflect."""
+    fixed_stretch: np.ndarray = array("fixed", unit="N/m")
+    """Rise of a wire's tension for each metre by which deflection lengthens the piece; 0: its tension is constant."""
+    fixed_strength: np.ndarray = array("fixed", unit="N")
+    """Tension at which a piece of wire breaks; 0: it never breaks."""
 
     fixed_shear_modulus: np.ndarray = array("fixed", unit="Pa")
     """Shear modulus of the wood of an arm that its shoots can twist; 0: the piece does not twist. An arm is the

@@ -180,7 +180,7 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     bunch_contact_damping_ratio: Positive = 3.0
     """[1] Damping ratio of a free bunch's contacts (MuJoCo's solref). TUNED: with 1, a bunch that fell a metre into a
     crate leaves it at up to 110 m/s."""
-    bunch_pool_size: Capacity = 12
+    bunch_pool_size: Annotated[int, msgspec.Meta(ge=0, le=1024)] = 12
     """Number of MuJoCo bodies kept ready for free (detached) bunches; when all are used, MuJoCo's model is recompiled
     with more (about 10 ms)."""
     dormant_radius: Positive = 2.5

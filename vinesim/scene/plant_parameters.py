@@ -182,6 +182,12 @@ class Trellis(_Part, frozen=True, kw_only=True):
     """Force along its wire at which a tie slips."""
     tie_strength: Annotated[Number, "N"] = Number(60.0, "N", "GUESSED", "as in vine.toml")
     """Force at which a tie breaks, or lets go of its wire."""
+    wire_modulus: Annotated[Number, "Pa"] = Number(2e11, "Pa", "GUESSED", "as in vine.toml")
+    """Young's modulus of a wire."""
+    wire_strength: Annotated[Number, "Pa"] = Number(6e8, "Pa", "GUESSED", "as in vine.toml")
+    """Stress at which a wire breaks."""
+    wire_anchor: Annotated[Number, "N/m"] = Number(5e4, "N/m", "GUESSED", "as in vine.toml")
+    """Stiffness along the wire of the post at each end of a piece."""
 
 
 class Specimen(_Part, frozen=True, kw_only=True):

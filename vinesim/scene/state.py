@@ -44,6 +44,9 @@ class State(StructOfArrays):
     """Distance by which each tie has slipped along its wire."""
     tie_broken: np.ndarray = array("tie", unit="1", dtype=np.bool_)
     """Whether the tie holds nothing any more."""
+    tie_flow: np.ndarray = array("tie", unit="m")
+    """Sum of all distances by which the tie has slipped, to either side. Of two states of a tie the one with the longer
+    way is the later one."""
     cut_segment: np.ndarray = array("bunch", unit="1", dtype=np.int32, fill=-1)
     """Body of the segment of its peduncle in which each bunch was cut off; -1: it hangs, or has parted at its own
     joint."""
@@ -54,13 +57,20 @@ class State(StructOfArrays):
     for all other bodies. A stump has the frame of that body."""
     stump_end: np.ndarray = array("body", unit="m")
     """Distance of that cut from the origin of the frame, where the stump ends; 0 for all other bodies."""
+    notch_depth: np.ndarray = array("body", unit="1")
+    """Depth of the deepest cut that has not gone through a segment of wood, as a share of the diameter there; 0: the
+    segment has none."""
+    notch_at: np.ndarray = array("body", unit="m")
+    """Distance of that cut from the segment's origin."""
+    leaf_off: np.ndarray = array("leaf", unit="1", dtype=np.bool_)
+    """Whether each leaf has been taken off. The array is replaced, never written, when leaves are taken off."""
 
     @classmethod
     def at_rest(cls, model: Model) -> State:
         """Returns the state with all trees asleep and without motion in the shape that their generator or builder
         gave them (``Model.joint_settled``)."""
         counts = model.counts()
-        state = cls.allocate(body=counts["body"], tree=counts["tree"], bunch=counts["bunch"], tie=counts["tie"])
+        state = cls.allocate(**{axis: counts[axis] for axis in ("body", "tree", "bunch", "tie", "leaf")})
         state.joint_q[:] = model.joint_settled
         state.body_q[:] = model.forward_kinematics(state.joint_q)
         return state

@@ -94,6 +94,20 @@ class BendingLaw:
     def __getitem__(self, rows: np.ndarray) -> BendingLaw:
         return BendingLaw(self.yields[rows], self.breaks[rows], self.hardening[rows], self.cracking[rows])
 
+    def notched(self, area: np.ndarray, modulus: np.ndarray) -> BendingLaw:
+        """Returns the law of wood of which cuts have left the shares ``area`` [k] of the cross-section and ``modulus``
+        [k] of the section modulus: its moments are smaller by the latter, the work of its crack by the former.
+
+        The slope of the rise stays, because a narrow cut hardly softens the wood.
+        """
+        modulus = np.maximum(modulus, 1e-9)
+        return BendingLaw(
+            self.yields * modulus,
+            self.breaks * modulus,
+            self.hardening * modulus,
+            self.cracking * np.maximum(area, 1e-9) / modulus,
+        )
+
     def capacity(self, flow: np.ndarray) -> np.ndarray:
         """Returns the moment [k] N m that joints bear after a ``flow`` [k] rad."""
         risen = np.clip(flow / np.maximum(self.hardening, 1e-12), 0.0, 1.0)

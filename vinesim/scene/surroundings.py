@@ -61,6 +61,10 @@ class Wire:
     """[N] A force across the wire deflects it as a string of this tension, without mass; 0: it does not deflect."""
     radius: float = 0.0014
     """[m]"""
+    stretch: float = 0.0
+    """[N/m] Rise of the tension for each metre by which deflection lengthens the wire; 0: the tension is constant."""
+    strength: float = 0.0
+    """[N] Tension at which the wire breaks; 0: it never breaks."""
 
     def __post_init__(self) -> None:
         span = checked_vector("wire: end", self.end, "m") - checked_vector("wire: start", self.start, "m")
@@ -68,6 +72,8 @@ class Wire:
             raise ValueError(f"wire: start and end are {self.start}; give two points [m] that differ")
         checked_number("wire: tension", self.tension, "N")
         checked_number("wire: radius", self.radius, "m", positive=True)
+        checked_number("wire: stretch", self.stretch, "N/m")
+        checked_number("wire: strength", self.strength, "N")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -112,6 +118,8 @@ def surroundings(plants: Model, wires: Sequence[Wire], ties: Sequence[Tie], boxe
         "fixed_organ": [int(Organ.WIRE)] * len(wires),
         "fixed_index": range(len(wires)),
         "fixed_tension": [wire.tension for wire in wires],
+        "fixed_stretch": [wire.stretch for wire in wires],
+        "fixed_strength": [wire.strength for wire in wires],
         "box_pose": [box.pose for box in boxes],
         "box_size": [box.size for box in boxes],
         "box_mass": [box.mass for box in boxes],

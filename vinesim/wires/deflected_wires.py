@@ -109,6 +109,23 @@ class DeflectedWires:
         """Pieces [k] whose offset is not 0; a view that the next step overwrites."""
         return self._geoms.deflected[: self._geoms.count[0]]
 
+    @property
+    def energy(self) -> float:
+        """[J] Elastic energy of wires and ties beyond the energy that :func:`vinesim.api.energy.energy` counts for the
+        ties, which is that of wires of their present, constant tension: half the sum of force times displacement for
+        the contacts that press on the wires, less what wires save whose tension has grown with their length."""
+        presses = self.presses
+        count = int(presses.count[0])
+        force = -presses.pushed[:count, None] * presses.normal[:count]
+        total = -self._supports.tightening
+        for j in np.flatnonzero(presses.pushed[:count] > 0.0):
+            on_it = presses.piece[:count] == presses.piece[j]
+            moved = self._supports.deflection_at(
+                int(presses.piece[j]), float(presses.along[j]), presses.along[:count][on_it], force[on_it]
+            )
+            total += 0.5 * float(force[j] @ moved)
+        return total
+
     def bind(self, contacts: SharedArrays) -> tuple[KernelGraph, KernelGraph]:
         """Returns two kernel graphs: the first finds the springs of ``contacts``, the second stores the contacts that
         press on a wire."""
@@ -155,7 +172,14 @@ class DeflectedWires:
         deflect = KernelLaunch(
             kernels.deflect_wires,
             [self._numbers, *self._supports.wire_structs[:2], self._tree_awake, share(self._rigid_asleep, wp.int32)],
-            [self._found.struct, self.presses.struct, self._load, self._is_loaded, self._geoms.struct],
+            [
+                self._found.struct,
+                self.presses.struct,
+                self._load,
+                self._is_loaded,
+                self._geoms.struct,
+                *self._supports.tension_arrays,
+            ],
             threads=1,
         )
         self._deflect = KernelGraph(deflect)

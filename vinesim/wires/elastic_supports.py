@@ -82,6 +82,7 @@ class ElasticSupports:
         self.load = np.zeros((len(self._tree), 3))
         """[node, 3] N: forces of contacts on the nodes of wires. The forces of ties are not included."""
         self._wire_ties = wires["tie"]
+        self._strength = np.where(model.fixed_strength > 0.0, model.fixed_strength, np.inf)
         self._tie_changes = 0
         first_tie = np.searchsorted(model.tie_body, model.tie_body[wires["tie"]])
         stiffness, last_stiffness = _springs_in_series(nodes["compliance"], nodes["whole"], nodes["is_arm"], first)
@@ -92,14 +93,15 @@ class ElasticSupports:
                 "stiffness": stiffness,
                 "last_stiffness": last_stiffness,
                 "tree": self._tree,
+                "piece": self._piece.astype(np.int32),
                 "number": np.append(wires["tie"] - first_tie, 0 * arms["body"]).astype(np.int32),
                 "wake_distance": WAKE_SHARE * parameters.sleep_distance / nodes["response"],
             }
             | {name: nodes[name] for name in ("axis", "body", "point", "origin")},
-            self._wires(wires),
+            self._wire_arrays(wires),
         )
 
-    def _wires(self, nodes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    def _wire_arrays(self, nodes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Returns the arrays of the pieces of wire for :func:`kernels.wire_spring`. ``nodes``: nodes of the wires."""
         model = self._plants.model
         tension = model.fixed_tension.astype(float)
@@ -109,7 +111,11 @@ class ElasticSupports:
         along = np.zeros(len(self._tree))
         along[: len(nodes["support"])] = nodes["compliance"] * tension[nodes["support"]]
         return {
-            "tension": tension,
+            "tension": tension.copy(),
+            "straight_tension": np.maximum(tension, 1e-9),
+            "stretch": model.fixed_stretch.astype(float),
+            "bulge": np.zeros(len(tension)),
+            "resistance": np.zeros(len(tension)),
             "length": np.linalg.norm(way, axis=1),
             "support": support,
             "node_along": along,
@@ -128,6 +134,7 @@ class ElasticSupports:
             "ratio": np.zeros(count),
             "velocity": np.zeros((count, 3)),
             "share": np.zeros(count),
+            "fall": np.zeros((count, 3)),
         }
         bodies = {
             "body_q": state.body_q,
@@ -150,9 +157,11 @@ class ElasticSupports:
         node_struct = self._nodes.struct
         body_struct = SharedArrays(kernels.SupportedBodies, **bodies).struct
         spring_struct = SharedArrays(kernels.SupportedSprings, **springs).struct
+        self._wires = SharedArrays(kernels.Wires, **wires)
         solve = KernelLaunch(
             kernels.balance_supports,
             [
+                self._wires.struct,
                 node_struct,
                 share(self._active_count, wp.int32),
                 share(self._active, wp.int32),
@@ -163,18 +172,47 @@ class ElasticSupports:
             [
                 SharedArrays(kernels.SupportState, **shape).struct,
                 spring_struct,
+                share(self._wires.tension, wp.float64),
+                share(self._wires.resistance, wp.float64),
                 share(self._is_moved, wp.bool),
                 share(self._moved_count, wp.int32),
             ],
         )
         self._solve = KernelGraph(solve)
-        self.wire_structs = SharedArrays(kernels.Wires, **wires).struct, node_struct, body_struct, spring_struct
+        self.tension_arrays = [
+            share(getattr(self._wires, name), wp.float64) for name in ("bulge", "tension", "resistance")
+        ]
+        """Arrays of ``kernels.Wires`` that change."""
+        self.wire_structs = self._wires.struct, node_struct, body_struct, spring_struct
         """Arguments of :func:`kernels.wire_spring`, except the loads."""
 
     def _slide(self, tie: int, way: np.ndarray) -> None:
         """Let a tie that slips along its wire hold it further on. The node's place in the wire's equations stays."""
         if tie in self._node_of:
             self._origin[self._node_of[tie]] += way
+
+    @property
+    def tension(self) -> np.ndarray:
+        """[piece] N, tension of each piece of wire now; 0 for a broken wire, and for pieces that are not taut wires."""
+        return self._wires.tension
+
+    def overloaded(self) -> np.ndarray:
+        """Returns the pieces of wire [k] whose tension has passed their strength."""
+        return np.flatnonzero(self._wires.tension > self._strength)
+
+    def break_wire(self, piece: int) -> np.ndarray:
+        """Let a piece of wire bear nothing any more. Returns the ties [k] that it held."""
+        self._wires.tension[piece] = self._wires.bulge[piece] = self._wires.resistance[piece] = 0.0
+        ties = self._wire_ties[self._plants.model.tie_wire[self._wire_ties] == piece]
+        return ties[~self._plants.state.tie_broken[ties]]
+
+    @property
+    def tightening(self) -> float:
+        """[J] Tension times lengthening of all wires, minus the work that lengthened them: their tension has grown
+        with their length."""
+        wires = self._wires
+        rise = np.where(wires.stretch > 0.0, np.maximum(wires.tension - wires.straight_tension, 0.0), 0.0)
+        return 0.5 * float((rise * rise / np.maximum(wires.stretch, 1e-9)).sum())
 
     def set_loaded(self, supports: np.ndarray) -> None:
         """Set the supports (wires or arms) [k] on which :attr:`load` acts until the next call."""
@@ -195,6 +233,22 @@ class ElasticSupports:
         self._was_active[:] = False
         self._was_active[self.active] = True
         return pieces[pieces >= 0]
+
+    def deflection_at(self, piece: int, x: float, at: np.ndarray, force: np.ndarray) -> np.ndarray:
+        """Returns the displacement [3] m of the point ``x`` [m] from the start of a piece of wire, which deflects by
+        its ties and by ``force`` [k, 3] N at the points ``at`` [k] m."""
+        wires, nodes = self._wires, self._nodes
+        support = int(wires.support[piece])
+        mine = slice(0, 0) if support < 0 else slice(*nodes.first[support : support + 2].tolist())
+        places = np.concatenate([[0.0], wires.node_along[mine], wires.length[[piece]]])
+        moved = np.concatenate([np.zeros((1, 3)), self.deflection[mine], np.zeros((1, 3))])
+        right = int(np.clip(np.searchsorted(places, x), 1, len(places) - 1))
+        low, high = places[right - 1 : right + 1]
+        share = (x - low) / max(high - low, 1e-9)
+        between = (at >= low) & (at <= high)
+        lever = np.maximum(np.minimum(at, x) - low, 0.0) * np.maximum(high - np.maximum(at, x), 0.0)
+        lever = np.where(between, lever, 0.0) / max(float(wires.tension[piece]) * (high - low), 1e-9)
+        return (1.0 - share) * moved[right - 1] + share * moved[right] + lever @ force
 
     def place(self, trees: np.ndarray) -> None:
         """Mark sleeping trees [k] as moved to another pose, so that the next :meth:`update` computes the wires and arms

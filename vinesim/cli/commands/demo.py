@@ -34,7 +34,10 @@ def demo(
         str, typer.Option(help="pick: freest, the bunch with most room for the hand first, or nearest.")
     ] = "freest",
     see: Annotated[
-        bool, typer.Option("--see", help="pick: find bunches by the robot's own camera, not by the simulation.")
+        bool,
+        typer.Option(
+            "--see", help="pick, prune: find bunches, canes by the robot's own camera, not by the simulation."
+        ),
     ] = False,
     seed: Seed = None,
     scene: Annotated[
@@ -73,10 +76,13 @@ def demo(
       vinesim demo --job exchange
       vinesim demo --job meet
       vinesim demo --job prune
+      vinesim demo --job prune --see
     """
     if job == "push":
         from vinesim.cli.demo.push_demo import run_push
+        from vinesim.client.tasks.registry import validate_sight
 
+        validate_sight(job, see)
         code = run_push(
             seconds=seconds or 20.0,
             seed=seed,

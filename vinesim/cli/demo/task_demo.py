@@ -14,7 +14,8 @@ from vinesim.cli.demo.summary import job_summary, write_summary
 from vinesim.client.programs import START_TIMEOUT, program_group
 from vinesim.client.tasks.harvesting import HarvestOptions
 from vinesim.client.tasks.planning import plan_meeting
-from vinesim.client.tasks.registry import UnknownTask
+from vinesim.client.tasks.pruning import PruningRule, prune
+from vinesim.client.tasks.registry import UnknownTask, validate_sight
 from vinesim.client.tasks.seen_harvest import SURVEY_TIME
 from vinesim.client.tasks.start_poses import bunch_centres, start_pose
 from vinesim.core.errors import writing
@@ -37,6 +38,10 @@ TIME_LIMIT = 120.0
 
 PRUNING_TIME = 400.0
 """Default limit of the simulated time of pruning one vine [s]."""
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+SEEN_PRUNING_TIME = 600.0
+"""As :data:`PRUNING_TIME`, by sight: with the time for looking around and for second tries [s]."""
 SETTLE_TIME = 2.0
 """Time after the time-out of a task itself [s], so that its own reason is reported."""
 
@@ -55,9 +60,11 @@ def run_job(
     headless: bool,
     out: pathlib.Path,
 ) -> int:
-    """Let one robot do a task, and write the results into ``out``. Returns 0 if the task was done, 5 otherwise."""
+    """Let one robot do a task, and write the results into ``out``. Returns 0 if the task was done, :data:`INTERRUPTED`
+    after Ctrl-C, 5 otherwise."""
     if job not in JOBS:
         raise UnknownTask(f"no job {job!r}; give push, {', '.join(list(JOBS)[:-1])} or {list(JOBS)[-1]}")
+    validate_sight(job, see)
     console = Console(stderr=True, markup=False)
     check_device(device)
     default_robot, done_key = JOBS[job]
@@ -65,6 +72,9 @@ def run_job(
     scene = scene or ("winter_spur" if job == "prune" else "harvest")
     plan = with_seed(load_scene(scene), seed)
     description = load_description(robot)  # raise errors before any process starts
+    if job == "prune":
+        model = generate(plan)
+        prune(model.nodes, model.canes, PruningRule())
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         robot = kept_robot_file(robot, description, out)
@@ -116,7 +126,12 @@ def run_job(
             "1",
         )
         newest[PICKER] = json.loads(picker.next_line(START_TIMEOUT))
-        show_progress(picker, visitor, server, newest, console, headless)
+        is_stopped = False
+        try:
+            show_progress(picker, visitor, server, newest, console, headless)
+        except KeyboardInterrupt:  # the programs end in order, and the summary tells how far the task came
+            is_stopped = True
+            picker.finish()
         if visitor is not None:
             visitor.finish()
     summary = job_summary(
@@ -139,13 +154,13 @@ def run_job(
             f"{summary['visitor']['bunches_picked']} of {summary['bunches_picked']} bunches off their vines"
         )
     console.print(f"pictures and summary.json are in {out}/")
-    return 0 if done else 5
+    return INTERRUPTED if is_stopped else 0 if done else 5
 
 
 def time_limit(job: str, harvest: HarvestOptions, see: bool) -> float:
     """Returns the default limit of the simulated time of a task [s]: a harvest by sight needs time to look around."""
     if job == "prune":
-        return PRUNING_TIME
+        return SEEN_PRUNING_TIME if see else PRUNING_TIME
     if job != "pick":
         return TIME_LIMIT
     return max(TIME_LIMIT, harvest.timeout + (SURVEY_TIME if see else 0.0)) + SETTLE_TIME

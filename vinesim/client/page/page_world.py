@@ -133,6 +133,7 @@ class PageWorld:
         present colours of the primitives marked here, so that the page also shows when a light goes out."""
         self._visuals: tuple[Any, ...] | None = None
         self._stumps = np.zeros((0, 3))
+        self._leaf_off = np.zeros(0, bool)
         client.after_reset.append(self._follow_reset)
         self._driver: int | None = None
         """The page that controls the spectator's eyes or the person: the first page that sends a message, with a person
@@ -336,7 +337,7 @@ class PageWorld:
         if newest is None or self._primitives is None or newest[0] <= since:
             return None
         tick, snapshot = newest
-        if snapshot.visuals is not self._visuals or not np.array_equal(snapshot.stumps, self._stumps):
+        if snapshot.visuals is not self._visuals or self._is_cut(snapshot):
             if not self._layout_lock.acquire(blocking=False):
                 return None
             try:
@@ -393,8 +394,9 @@ class PageWorld:
         self._visuals = snapshot.visuals
         rows = slice(primitives.plant_count, primitives.count)
         columns = _columns(primitives, rows)
-        is_cut = not np.array_equal(snapshot.stumps, self._stumps)
+        is_cut = self._is_cut(snapshot)
         self._stumps = snapshot.stumps
+        self._leaf_off = snapshot.leaf_off
         if before is None or is_cut or not _differ_in_lights_only(before, snapshot.visuals):
             self._lay_out_rigid(primitives, snapshot, rows)
             self._laid_out = columns
@@ -407,6 +409,11 @@ class PageWorld:
             "lamp_surface": columns["surface"][lamps],
             "lamp_material": columns["material"][lamps],
         }
+
+    def _is_cut(self, snapshot: Snapshot) -> bool:
+        """Returns whether canes were cut or leaves taken off since the shapes were encoded."""
+        has_shed = snapshot.leaf_off is not self._leaf_off and not np.array_equal(snapshot.leaf_off, self._leaf_off)
+        return has_shed or not np.array_equal(snapshot.stumps, self._stumps)
 
     def _lay_out_rigid(self, primitives: Primitives, snapshot: Snapshot, rows: slice) -> None:
         self._rigid_version += 1

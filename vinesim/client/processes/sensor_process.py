@@ -244,6 +244,7 @@ class SensorProcess:
             shared["tree_number"][trees] = shared["number"][0] = self._snapshot_count
             shared["bunch_attached"][:] = physics.state.bunch_attached
             stumps = physics.plants.stumps.table
+            shared["leaf_off"][:] = physics.state.leaf_off
             shared["stump_count"][0] = len(stumps)
             shared["stumps"][: len(stumps)] = stumps
             wires = physics.wire_shapes.poses()

@@ -131,6 +131,7 @@ class SensorChannel:
                 "visual_count": ((1,), "i8"),
                 "body_q": ((bodies, 7), "f4"),
                 "bunch_attached": ((bunches,), "?"),
+                "leaf_off": ((len(model.leaf_body),), "?"),
                 "stump_count": ((1,), "i8"),
                 "stumps": ((int(model.tree_spares.sum()), 3), "f8"),
                 "wire_count": ((1,), "i8"),
@@ -452,6 +453,8 @@ class SensorWorker(Worker):
                     shared["tree_drawn"].copy(),
                 )
             self._state.bunch_attached[:] = shared["bunch_attached"]
+            if not np.array_equal(shared["leaf_off"], self._state.leaf_off):
+                self._state.leaf_off = shared["leaf_off"].copy()
             self._stumps = shared["stumps"][: int(shared["stump_count"][0])].copy()
             self._frame_score = float(shared["frame_score"][0])
             self._time = time = float(shared["time"][0])
@@ -477,6 +480,7 @@ class SensorWorker(Worker):
             wind,
             wire_poses,
             self._stumps,
+            state.leaf_off,
         )
         return snapshot, [(float(t), dict(zip(names, q, strict=True))) for t, q in zip(times, poses, strict=True)]
 

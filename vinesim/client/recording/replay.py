@@ -268,7 +268,7 @@ def _split_records(records: list[RetainedRecord]) -> Iterable[list[RetainedRecor
     size = 0
     for record in records:
         part.append(record)
-        size += 64 + 4 * len(record.cut) + len(record.trees)
+        size += 64 + 4 * len(record.cut) + len(record.trees) + len(record.wood)
         if size > MAX_REPLY:
             yield part
             part = []

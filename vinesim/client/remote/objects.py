@@ -20,7 +20,7 @@ from vinesim.net.replication.receiver import Inbox
 from vinesim.net.replication.streams import NO_ROOTS, DetachedRoots
 from vinesim.scene.ids import ObjectKind, is_tree, object_id, parse_object_name, split_object_id
 from vinesim.scene.spare_bodies import PLACE_STEP
-from vinesim.scene.values import Breakage, Detachment, GivenWood, ObjectUpdate, TreeUpdate
+from vinesim.scene.values import Breakage, Detachment, ObjectUpdate, TreeUpdate
 from vinesim.world import Physics
 
 BLEND_PER_STEP = 0.2
@@ -101,8 +101,12 @@ class ObjectSync:
             if is_tree(record.object):
                 self._apply_cuts(record)
                 self._apply_wood(record)
-            elif record.stalk is not None:
-                self._apply_stalk(record.object, *record.stalk)
+            else:
+                if record.stalk is not None:
+                    self._apply_stalk(record.object, *record.stalk)
+                kind, bunch = split_object_id(record.object)
+                if record.fruit is not None and kind == ObjectKind.BUNCH:
+                    self.physics.fruit_monitor.learn(bunch, *record.fruit)
             known = newest.get(record.object)
             if known is None or (holds, known[0].claim) == (True, record.claim) or wins(record.claim, known[0].claim):
                 newest.pop(record.object, None)
@@ -189,23 +193,14 @@ class ObjectSync:
         self.physics.apply_remote_wood(record.object, decode_wood(record.wood))
 
     def wood_of(self, tree: int) -> bytes:
-        """Returns how the wood and ties of a tree have given, as its record states it."""
-        model = self.physics.model
-        state = self.physics.state
-        bodies = model.bodies_of(tree)
-        joints = np.flatnonzero((state.joint_flow[bodies] > 0.0) & ~state.body_cut[bodies])
-        ties = np.flatnonzero(model.body_tree[model.tie_body] == tree)
-        gave = np.flatnonzero(state.tie_broken[ties] | (state.tie_slid[ties] != 0.0))
-        own = bodies.start + joints
-        given = GivenWood(
-            joints,
-            state.joint_set[own],
-            state.joint_flow[own],
-            gave,
-            state.tie_slid[ties[gave]],
-            state.tie_broken[ties[gave]],
-        )
-        return encode_wood(given)
+        """Returns how a tree has changed for good, besides cuts, as its record states it."""
+        return encode_wood(self.physics.given_wood(tree))
+
+    def fruit_of(self, number: int) -> tuple[float, float] | None:
+        """Returns how many berries of a bunch burst and were lost, as its record states it; None for other objects and
+        for bunches that were not handled."""
+        kind, bunch = split_object_id(number)
+        return self.physics.fruit_monitor.berries_off(bunch) if kind == ObjectKind.BUNCH else None
 
     def _apply_stalk(self, number: int, segment: int, steps: int) -> None:
         """Cut a bunch where its record names the cut, or give a bunch that was cut before its record came the stalk

@@ -19,6 +19,7 @@ import numpy as np
 from vinesim.client.tasks import planning
 from vinesim.client.tasks.planning import BoxApproach
 from vinesim.client.tasks.start_poses import PlacementError
+from vinesim.client.vine_events import fruit_report
 from vinesim.core import frames
 from vinesim.core.errors import UsageError
 from vinesim.robot.control.waypoint_follower import WaypointFollower
@@ -92,6 +93,12 @@ class Attempt:
     """Duration, drive to the bunch included [s]."""
     reason: str
     """Why it failed; empty if it succeeded."""
+    berries_burst: float = 0.0
+    """Expected number of berries, of any bunch, whose skins burst in the attempt."""
+    berries_lost: float = 0.0
+    """Expected number of berries, of any bunch, that fell off in the attempt."""
+    damage: float | None = None
+    """Share of the berries of the bunch that was cut which burst or fell off; None if no bunch was cut."""
 
 
 class Harvest(Task, abc.ABC):
@@ -125,8 +132,8 @@ class Harvest(Task, abc.ABC):
     def report(self) -> dict[str, Any]:
         """Returns the result as plain values for JSON: number of bunches picked and tried, seconds, and each attempt.
 
-        ``others_off`` counts bunches that left their vines without being picked. ``berries_lost`` is null: the
-        simulation does not count berries.
+        ``others_off`` counts bunches that left their vines without being cut as the bunch of an attempt.
+        ``berries_burst`` and ``berries_lost`` are expected numbers of berries of all bunches.
         """
         reasons = collections.Counter(one.reason.split(":")[0] for one in self.attempts if one.reason)
         tried = len({one.bunch for one in self.attempts})
@@ -140,8 +147,9 @@ class Harvest(Task, abc.ABC):
             "order": str(self.options.order),
             "failed_in_phase": dict(reasons),
             "others_off": off - self._cut,
-            "berries_lost": None,
-            "bunches": [dataclasses.asdict(one) | {"seconds": round(one.seconds, 2)} for one in self.attempts],
+            "berries_burst": round(sum(one.berries_burst for one in self.attempts), 2),
+            "berries_lost": round(sum(one.berries_lost for one in self.attempts), 2),
+            "bunches": [_rounded(one) for one in self.attempts],
             "last": None if self.pick is None else self.pick.report(),
             **super().report(),
         }
@@ -153,24 +161,31 @@ class Harvest(Task, abc.ABC):
         tries: collections.Counter[int] = collections.Counter()
         while self.picked < self.options.most:
             start = self.time
+            burst, lost = self._berries()
             plan = yield from self.choose({bunch for bunch, count in tries.items() if count >= self.options.tries})
             if plan is None:
                 break
             tries[plan.bunch] += 1
             yield from self._go_to(plan.base_pose)
             self.pick = pick = self.new_pick(plan)
+            cut: list[int] = []
             while not pick.is_done:
                 pick.control(self.time)
                 yield pick.phase
-            self.attempts.append(Attempt(plan.bunch, pick.picked, self.time - start, pick.reason))
+                cut += self._bunches_cut()
+            self.attempts.append(result := Attempt(plan.bunch, pick.picked, self.time - start, pick.reason))
             if pick.is_cut:  # otherwise a bunch that failed hangs on its vine and is tried again
                 tries[plan.bunch] = self.options.tries
-                self._cut += 1
+            self._cut += bool(cut)
             if pick.phase in BOX_PHASES:
                 yield from self._leave_box(pick)
             else:
                 yield from self._nested(pick, pick.withdraw())
-            self.attempts[-1].seconds = self.time - start
+            result.seconds = self.time - start
+            after = self._berries()
+            result.berries_burst = after[0] - burst
+            result.berries_lost = after[1] - lost
+            result.damage = self.physics.fruit_monitor.history(cut[0]).damage if cut else None
         if not self.picked:
             raise TaskFailed(self._why_empty())
 
@@ -182,6 +197,16 @@ class Harvest(Task, abc.ABC):
     def new_pick(self, plan: PickPlan) -> PickBunch:
         """Returns the task of one attempt."""
         return PickBunch(self.physics, self.robot, plan)
+
+    def _bunches_cut(self) -> list[int]:
+        """Returns the bunches that the robot's blades cut off in the last step."""
+        mine = [one for one in self.physics.detachments if one.cause == "blade" and one.actor == self.robot.name]
+        return [one.bunch for one in mine if one.bunch >= 0]
+
+    def _berries(self) -> tuple[float, float]:
+        """Returns the expected numbers of berries of all bunches that burst and that fell off so far."""
+        fruit = fruit_report(self.physics)
+        return fruit["berries_burst"], fruit["berries_lost"]
 
     def _why_empty(self) -> str:
         """Returns why no bunch is in the crate."""
@@ -244,6 +269,12 @@ class HarvestByTruth(Harvest):
         gone = set(np.flatnonzero(~self.physics.state.bunch_attached).tolist())
         yield from ()
         return self._candidates.next_plan(self._base()[:2], gone | given_up, self.options, self.picked)
+
+
+def _rounded(attempt: Attempt) -> dict[str, Any]:
+    """Returns an attempt as plain values for JSON, to three digits."""
+    values = dataclasses.asdict(attempt)
+    return {name: round(value, 3) if isinstance(value, float) else value for name, value in values.items()}
 
 
 Grasp = tuple[int, str, np.ndarray, float]

@@ -24,11 +24,14 @@ from vinesim.scene.model import Model
 from vinesim.scene.nodes import DormantCanes, Nodes
 from vinesim.scene.terrain import on_ground
 
-REMOVED_AT = 0.5
-"""Place at which a cane is removed, as a share of the way from its base to its first node. GUESSED: pruners leave a
-collar of about a centimetre, in which the wood dries back."""
+REMOVED_AT = 0.7
+"""Place at which a cane is removed, as a share of the way from its base to its first node. GUESSED: the wood dries back
+over two to three diameters, so that about 3 cm are left; the blades are then beside no bud of the other cane of a spur,
+which stands an internode higher or lower."""
 ABOVE_BUD = 0.015
 """[m] Distance of a cut above the last bud that is kept. Handbooks ask for one to two centimetres; GUESSED."""
+CANES_OF_SPUR = 3
+"""Largest number of canes on a spur; longer two-year wood is a fruiting cane."""
 ROW_DISTANCE = 0.80
 """[m] Distance of the base's centre from the cane, across the row; the row is to the robot's left."""
 CANE_AHEAD = 0.35
@@ -55,17 +58,20 @@ class PruningRule:
     shortest: float = 0.6
     """[m] Shorter canes are not kept."""
     buds: int = 2
-    """Number of buds that stay on a kept cane."""
+    """Number of buds that stay on a kept cane of a spur."""
+    cane_buds: int = 10
+    """Number of buds that stay on a cane that becomes a fruiting cane. GUESSED: eight to twelve are usual."""
     keep: int = 1
     """Number of canes that stay of each group."""
     of: str = "spur"
-    """Group of canes of which ``keep`` stay: ``"spur"``, the canes on one piece of two-year wood, or ``"vine"``."""
+    """Group of canes of which ``keep`` stay: ``"spur"``, the canes on one piece of two-year wood, or ``"vine"``. With
+    ``"spur"`` the fruiting canes of vines that were pruned to canes are renewed, see :func:`prune`."""
 
     def __post_init__(self) -> None:
         """Raises :class:`UsageError` for values that no rule can have."""
         if self.of not in ("spur", "vine"):
             raise UsageError(f"rule: of is {self.of!r}; give 'spur' or 'vine'")
-        for name in ("buds", "keep"):
+        for name in ("buds", "cane_buds", "keep"):
             if getattr(self, name) < 1:
                 raise UsageError(f"rule: {name} is {getattr(self, name)}; give 1 or more")
 
@@ -99,6 +105,10 @@ def prune(nodes: Nodes, canes: DormantCanes, rule: PruningRule) -> tuple[Cut, ..
     """Returns the cuts of a rule, vine by vine and group by group: first those that shorten kept canes, then those that
     remove the others.
 
+    Vines that were pruned to canes have a fruiting cane on either side, and a renewal spur. Each fruiting cane is cut
+    off with all that stands on it. Of the canes on a renewal spur the best becomes the next fruiting cane, and keeps
+    ``rule.cane_buds``. The others become the next renewal spur.
+
     Raises :class:`UsageError` if there are no dormant canes, or the rule lets none of them stay.
     """
     last = np.flatnonzero(canes.year == 1)
@@ -112,14 +122,30 @@ def prune(nodes: Nodes, canes: DormantCanes, rule: PruningRule) -> tuple[Cut, ..
             f"{1e3 * canes.diameter[last].max():.1f} mm and up to {canes.length[last].max():.2f} m"
         )
     group = canes.parent if rule.of == "spur" else canes.vine
+    fruiting = _fruiting_canes(canes)
+    renewed = np.unique(canes.vine[fruiting])
     found: list[Cut] = []
     for one in np.unique(np.column_stack([canes.vine[last], group[last]]), axis=0):
         mine = last[(canes.vine[last] == one[0]) & (group[last] == one[1])]
+        if rule.of == "spur" and one[1] in fruiting:
+            found.append(_removed(nodes, canes, int(one[1])))
+            continue
         mine = mine[np.argsort(rated[mine], kind="stable")]
         kept = [cane for cane in mine[: rule.keep].tolist() if np.isfinite(rated[cane])]
+        if rule.of == "spur" and one[0] in renewed:
+            buds = [rule.cane_buds if cane in kept else rule.buds for cane in mine.tolist()]
+            cuts = [_shortened(nodes, cane, many) for cane, many in zip(mine.tolist(), buds, strict=True)]
+            found += [cut for cut in cuts if cut is not None]
+            continue
         found += [cut for cane in kept if (cut := _shortened(nodes, cane, rule.buds)) is not None]
         found += [_removed(nodes, canes, cane) for cane in mine.tolist() if cane not in kept]
     return tuple(found)
+
+
+def _fruiting_canes(canes: DormantCanes) -> np.ndarray:
+    """Returns the ids of pieces of two-year wood that bear more canes than a spur [k]."""
+    parents, count = np.unique(canes.parent[canes.year == 1], return_counts=True)
+    return parents[count > CANES_OF_SPUR]
 
 
 def _shortened(nodes: Nodes, cane: int, buds: int) -> Cut | None:

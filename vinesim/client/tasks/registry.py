@@ -11,11 +11,13 @@ from vinesim.client.tasks.harvesting import NO_BOX, Candidates, HarvestByTruth, 
 from vinesim.client.tasks.planning import box_approaches, fill_box, plan_meeting, plan_swap
 from vinesim.client.tasks.pruning import PruningRule, plan_pruning
 from vinesim.client.tasks.seen_harvest import HarvestBySight
+from vinesim.client.tasks.seen_pruning import PruneBySight, VineStretch, vine_stretch
 from vinesim.client.tasks.start_poses import PlacementError
+from vinesim.core.errors import UsageError
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.meet_person import MeetPerson
 from vinesim.robot.tasks.prune import PruneCanes
-from vinesim.robot.tasks.sight import Eyes
+from vinesim.robot.tasks.sight import RobotSight
 from vinesim.robot.tasks.swap_boxes import SwapBoxes, SwapPlan
 from vinesim.robot.tasks.task import Task
 from vinesim.scene.model import Model
@@ -23,6 +25,10 @@ from vinesim.world import Physics
 
 TASKS = ("pick", "exchange", "meet", "prune")
 """Names of the tasks that :func:`plan_task` plans."""
+
+
+SEEING_TASKS = ("pick", "prune")
+"""Names of the tasks in which the robot can find plants by its own camera."""
 
 
 class UnknownTask(ValueError):
@@ -36,22 +42,33 @@ def validate_task_name(job: str | None) -> str | None:
     return job
 
 
+def validate_sight(job: str | None, see: bool) -> None:
+    """Raises :class:`UsageError` if the robot is to see and ``job`` has no such way."""
+    if see and job not in SEEING_TASKS:
+        given = "no --job" if job is None else f"--job {job}"
+        raise UsageError(f"--see with {given}: only {' and '.join(SEEING_TASKS)} go by the camera; leave out --see")
+
+
 def plan_task(
     job: str,
     model: Model,
     near: np.ndarray,
     harvest: HarvestOptions | None = None,
-    eyes: Callable[[Physics, Robot], Eyes] | None = None,
+    eyes: Callable[[Physics, Robot], RobotSight] | None = None,
 ) -> tuple[Callable[[Physics, Robot], Task], np.ndarray]:
     """Plan a task. Returns a function that begins it, and the pose [7] at which the robot must start.
 
     ``near`` [7]: usual start pose of the robot. ``harvest``: which bunches are picked; one, unless given. ``eyes``:
-    makes the eyes of a robot that picks by sight; without it, it picks by poses of the simulation. Planning takes 1 to
-    2 s, too long for the real-time loop. Raises :class:`UnknownTask`, and :class:`PlacementError` if the scene has no
-    room for the task.
+    makes the eyes of a robot that picks or prunes by sight; without it, it works by poses of the simulation. Planning
+    takes 1 to 2 s, too long for the real-time loop. Raises :class:`UnknownTask`, :class:`UsageError` if the task has no
+    way by sight, and :class:`PlacementError` if the scene has no room for the task.
     """
-    if validate_task_name(job) == "pick":
+    validate_task_name(job)
+    validate_sight(job, eyes is not None)
+    if job == "pick":
         options = harvest or HarvestOptions()
+        if not len(model.bunch_body):
+            raise PlacementError("this vineyard has no bunch to pick; raise fruit.bunches in its scene file")
         if eyes is not None:
             if next(box_approaches(model), None) is None:
                 raise PlacementError(NO_BOX)
@@ -61,6 +78,9 @@ def plan_task(
         if plan is None:
             raise PlacementError("no bunch hangs where a robot reaches it and drives to a box; choose another seed")
         return functools.partial(HarvestByTruth, options=options, candidates=candidates), plan.base_pose
+    if job == "prune" and eyes is not None:
+        stretch = vine_stretch(model, near[:2])
+        return functools.partial(_begin_pruning_by_sight, stretch=stretch, eyes=eyes), stretch.start(model)
     if job == "prune":
         stops = plan_pruning(model, near[:2], PruningRule())
         return functools.partial(PruneCanes, stops=stops), stops[0].base_pose
@@ -71,9 +91,19 @@ def plan_task(
 
 
 def _begin_harvest_by_sight(
-    physics: Physics, robot: Robot, options: HarvestOptions, near: np.ndarray, eyes: Callable[[Physics, Robot], Eyes]
+    physics: Physics,
+    robot: Robot,
+    options: HarvestOptions,
+    near: np.ndarray,
+    eyes: Callable[[Physics, Robot], RobotSight],
 ) -> HarvestBySight:
     return HarvestBySight(physics, robot, options, near, eyes(physics, robot))
+
+
+def _begin_pruning_by_sight(
+    physics: Physics, robot: Robot, stretch: VineStretch, eyes: Callable[[Physics, Robot], RobotSight]
+) -> PruneBySight:
+    return PruneBySight(physics, robot, stretch, PruningRule(), eyes(physics, robot))
 
 
 def _begin_swap(physics: Physics, robot: Robot, swap: SwapPlan) -> SwapBoxes:

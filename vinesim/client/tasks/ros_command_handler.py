@@ -30,6 +30,7 @@ from vinesim.ros.commands.types import (
     LightsPattern,
     LightsSound,
     LoudspeakerSound,
+    PlantWork,
 )
 
 log = logging.getLogger(__name__)
@@ -126,6 +127,8 @@ class RosCommandHandler:
                 controllers.command_motor(command.controller, command.joint, command.position)
             case GripperGoal():
                 controllers.start_gripper(command.controller, command.position, command.max_effort, time, command.goal)
+            case PlantWork():
+                log.info("%s %s", self.robot.name, self.robot.work_on_plant(command.what))
             case CancelGoal():
                 controllers.cancel(command.goal, time)
             case LightsSound():

@@ -3,5 +3,5 @@
 Each stage is a module. In their order: ``broadphase``, ``narrowphase_rigid`` and ``narrowphase_plants``, ``islands``,
 ``jacobians``, ``row_response``, ``delassus``, ``projected_gauss_seidel`` with the steps of ``newton`` on an
 ``island_system``, ``forces``. ``structs`` groups their arrays; ``distance`` and ``body_motion`` hold the geometry. The
-modules named ``tree_`` and ``row_solver`` do the same work for batches of trees. All solvers call ``friction_law``.
+kernels of batches of worlds (:mod:`vinesim.kernels.worlds`) do the same work. All solvers call ``friction_law``.
 """

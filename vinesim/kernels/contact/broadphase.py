@@ -85,25 +85,10 @@ def is_collidable(level: int, is_fine: bool, bunch: int, bunch_attached: wp.arra
     return collides
 
 
-@wp.kernel
-def geom_aabbs(
-    # model
-    parameters: Parameters,
-    geoms: Geoms,
-    # in
-    count: wp.array(dtype=wp.int32),
-    rigid: RigidBodies,
-    # out
-    states_out: GeomStates,
-):
-    """One thread per geom. Compute the motion of its centre, and its bounding box, enlarged by its possible motion in
-    the step.
-
-    count: [1] number of geoms.
-    """
-    g = wp.tid()
-    if g >= count[0]:
-        return
+@wp.func
+def geom_motion(g: int, parameters: Parameters, geoms: Geoms, rigid: RigidBodies, states_out: GeomStates):
+    """Compute the motion of the centre of geom ``g``, and its bounding box, enlarged by its possible motion in the
+    step."""
     rotation = rigid.xmat[geoms.id[g]]
     center = rigid.xpos[geoms.id[g]] + rotation * geoms.center[g]
     body = geoms.body[g]
@@ -148,6 +133,23 @@ def geom_aabbs(
     states_out.speed[g] = speed
     states_out.low[g] = middle - box
     states_out.high[g] = middle + box
+
+
+@wp.kernel
+def geom_aabbs(
+    # model
+    parameters: Parameters,
+    geoms: Geoms,
+    # in
+    count: wp.array(dtype=wp.int32),
+    rigid: RigidBodies,
+    # out
+    states_out: GeomStates,
+):
+    """One thread per geom. Compute its motion and its bounding box by :func:`geom_motion`. count: [1] number of geoms."""
+    g = wp.tid()
+    if g < count[0]:
+        geom_motion(g, parameters, geoms, rigid, states_out)
 
 
 @wp.func

@@ -1,7 +1,7 @@
 """The contact law, and the functions that solvers need for it: compressive normal impulse, Coulomb friction cone.
 
 All solvers of contacts with plants call these functions, on a CPU and on a GPU: for islands
-(``projected_gauss_seidel``, ``newton``), for the trees of batches (``tree_solver``), and for the trees of batches with
+(``projected_gauss_seidel``, ``newton``), for batches of worlds (``dense_solver``), and for batches of worlds with
 rows in the registers of a GPU (``row_solver``).
 
 A contact has an impulse x = (x_n, x_u, x_v) [N s] along its normal and its tangents, and a residual velocity

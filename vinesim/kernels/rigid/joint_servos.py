@@ -1,5 +1,7 @@
 """Servos of a robot: set-points that respect limits of position, velocity and effort, and MuJoCo's controls."""
 
+from typing import Any
+
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
@@ -115,6 +117,48 @@ class BaseDrive:
     actuator: wp.array(dtype=wp.int64)
 
 
+@wp.func
+def joint_control(
+    stiffness: Any, damping_at_start: Any, damping_at_end: Any, target: Any, target_velocity: Any, velocity: Any
+):
+    """Returns MuJoCo's control [N m or N] of a joint's servo, whose effort is the control minus K q minus D v.
+
+    Gains as in :class:`JointDrives`; target: position and velocity; velocity: of the joint at the start of the step.
+    """
+    damping = damping_at_end + damping_at_start
+    pull = stiffness * target + damping * target_velocity
+    return pull - damping_at_start * velocity
+
+
+@wp.func
+def base_control(
+    axis: int,
+    dt: Any,
+    stiffness: Any,
+    damping: Any,
+    slip: Any,
+    yaw: Any,
+    commanded: Any,
+    position: Any,
+    target: Any,
+):
+    """Returns the new target [m or rad] of one coordinate of a planar base (``axis``: 0 x, 1 y, 2 yaw), and MuJoCo's
+    control of its servo [N or N m].
+
+    commanded: velocity [m/s, m/s, rad/s] in the axes of the base. If the base is held back by more than ``slip``, its
+    wheels slip: the target stays near the base.
+    """
+    c = wp.cos(yaw)
+    s = wp.sin(yaw)
+    velocity = commanded[2]
+    if axis == 0:
+        velocity = c * commanded[0] - s * commanded[1]
+    if axis == 1:
+        velocity = s * commanded[0] + c * commanded[1]
+    moved = wp.clamp(target + dt * velocity, position - slip, position + slip)
+    return moved, stiffness * moved + damping * velocity
+
+
 @wp.kernel
 def apply_controls(
     # model
@@ -136,26 +180,30 @@ def apply_controls(
     rad].
     """
     for i in range(drives.target.shape[0]):
-        damping = drives.damping_at_end[i] + drives.damping_at_start[i]
-        pull = drives.stiffness[i] * drives.target[i] + damping * drives.target_velocity[i]
-        control = pull - drives.damping_at_start[i] * qvel[drives.v[i]] + drives.feedforward[i]
+        control = drives.feedforward[i] + joint_control(
+            drives.stiffness[i],
+            drives.damping_at_start[i],
+            drives.damping_at_end[i],
+            drives.target[i],
+            drives.target_velocity[i],
+            qvel[drives.v[i]],
+        )
         control_out[i] = control
-        actuator = drives.actuator[i]
-        ctrl_out[actuator] = control
+        ctrl_out[drives.actuator[i]] = control
     if base.actuator.shape[0] == 0:
         return
-    yaw = qpos[base.q[2]]
-    c = wp.cos(yaw)
-    s = wp.sin(yaw)
-    slip = base.slip[0]
+    commanded = wp.vec3d(base.velocity[0], base.velocity[1], base.velocity[2])
     for i in range(3):
-        velocity = base.velocity[2]
-        if i == 0:
-            velocity = c * base.velocity[0] - s * base.velocity[1]
-        if i == 1:
-            velocity = s * base.velocity[0] + c * base.velocity[1]
-        position = qpos[base.q[i]]  # if the base is held back too far, its wheels slip: the target stays near the base
-        target = wp.clamp(base_target_out[i] + dt * velocity, position - slip, position + slip)
+        target, control = base_control(
+            i,
+            dt,
+            base.stiffness[i],
+            base.damping[i],
+            base.slip[0],
+            qpos[base.q[2]],
+            commanded,
+            qpos[base.q[i]],
+            base_target_out[i],
+        )
         base_target_out[i] = target
-        actuator = base.actuator[i]
-        ctrl_out[actuator] = base.stiffness[i] * target + base.damping[i] * velocity
+        ctrl_out[base.actuator[i]] = control

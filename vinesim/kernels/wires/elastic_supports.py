@@ -26,6 +26,11 @@ from vinesim.kernels.plants.spatial import half_rotation
 
 wp.set_module_options({"enable_backward": False})
 
+LEAST_RISE = wp.constant(wp.float64(1.0e-4))
+"""[1] Change of a wire's tension, as a share of it, that is not followed further."""
+MOST_TURNS = wp.constant(12)
+"""Largest number of steps of Newton's method for the tension of a wire in one step."""
+
 
 @wp.struct
 class SupportNodes:
@@ -46,6 +51,7 @@ class SupportNodes:
     body: wp.array(dtype=wp.int32)  # body that the tie holds; on an arm, the root
     tree: wp.array(dtype=wp.int32)  # tree of that body
     number: wp.array(dtype=wp.int32)  # index of the tie among the ties of its body
+    piece: wp.array(dtype=wp.int32)  # [support] piece of wire, -1 for an arm
     point: wp.array(dtype=wp.vec3d)  # [m] point of the tie in the body
     origin: wp.array(
         dtype=wp.vec3d
@@ -63,13 +69,22 @@ class SupportState:
     ratio: wp.array(dtype=wp.float64)  # [1] ratio of a node's deflection to that of the next node
     velocity: wp.array(dtype=wp.vec3d)  # [m/s], [rad/s, 0, 0]
     share: wp.array(dtype=wp.float64)  # [1] deflection by a common displacement of all awake trees, per unit of it
+    fall: wp.array(dtype=wp.vec3d)  # [m/N] decrease of the deflection per unit of tension
 
 
 @wp.struct
 class Wires:
     """Wires under tension. Arrays are [piece] over all fixed pieces of the scene, unless stated otherwise."""
 
-    tension: wp.array(dtype=wp.float64)  # [N] tension
+    tension: wp.array(dtype=wp.float64)  # [N] tension now; 0: the wire is broken
+    straight_tension: wp.array(dtype=wp.float64)  # [N] tension while the wire is straight
+    stretch: wp.array(dtype=wp.float64)  # [N/m] rise of the tension for each metre that the piece gets longer
+    bulge: wp.array(
+        dtype=wp.float64
+    )  # [N^2 m] lengthening by presses, beyond that of the line through the nodes, times tension squared
+    resistance: wp.array(
+        dtype=wp.float64
+    )  # [1] fall of (tension - stretch * lengthening) if the tension falls, minus 1, per unit
     length: wp.array(dtype=wp.float64)  # [m] length
     support: wp.array(dtype=wp.int32)  # index of the piece's support; -1: no tie is bound to the piece
     node_along: wp.array(dtype=wp.float64)  # [node] m, distance from the start of the node's piece
@@ -176,54 +191,75 @@ def turn_rest(
     springs_out.root_softening[tree] = vec3f(wp.sqrt(wp.max(share, wp.float64(0.0)) / stiffness) * gradient)
 
 
-@wp.kernel
-def balance_supports(
-    # model
-    nodes: SupportNodes,
-    # in
-    count: wp.array(dtype=wp.int32),
-    supports: wp.array(dtype=wp.int32),
-    tree_awake: wp.array(dtype=wp.bool),
-    is_placed: wp.array(dtype=wp.bool),
-    bodies: SupportedBodies,
-    # out
-    state_out: SupportState,
-    springs_out: SupportedSprings,
-    is_moved_out: wp.array(dtype=wp.bool),
-    moved_count_out: wp.array(dtype=wp.int32),
-):
-    """One thread solves the static balance of one support (wire or arm) with the trees on it, by tridiagonal
-    elimination.
+@wp.func
+def stiffness_before(i: int, support: int, nodes: SupportNodes):
+    """Returns the stiffness of the part of a support before node ``i``; beyond its last node, of the part behind it."""
+    if i < nodes.first[support + 1]:
+        return nodes.stiffness[i]
+    return nodes.last_stiffness[support]
 
-    count: [1] number of supports; supports: [thread] index of the support; is_placed: [tree] sleeping trees that were
-    moved to another pose since the last step; state, springs: results at this support's nodes; is_moved: [tree] set for
-    sleeping trees whose support has moved further than ``wake_distance`` since they fell asleep; moved_count: [1]
-    number of such trees.
+
+@wp.func
+def kink(i: int, support: int, nodes: SupportNodes, deflection: wp.array(dtype=wp.vec3d)):
+    """Returns the change of the length of a wire, times its straight tension, per displacement of node ``i`` [N]."""
+    here = deflection[i]
+    before = wp.vec3d()
+    after = wp.vec3d()
+    if i > nodes.first[support]:
+        before = deflection[i - 1]
+    if i + 1 < nodes.first[support + 1]:
+        after = deflection[i + 1]
+    left = stiffness_before(i, support, nodes)
+    right = stiffness_before(i + 1, support, nodes)
+    return left * (here - before) - right * (after - here)
+
+
+@wp.func
+def lengthening(support: int, straight: wp.float64, nodes: SupportNodes, deflection: wp.array(dtype=wp.vec3d)):
+    """Returns by how much [m] the line through the nodes of a wire with ``deflection`` is longer than the straight
+    wire: the sum of squares of its slopes times lengths, halved."""
+    total = wp.float64(0.0)
+    last = wp.vec3d()
+    for i in range(nodes.first[support], nodes.first[support + 1]):
+        total += nodes.stiffness[i] * wp.length_sq(deflection[i] - last)
+        last = deflection[i]
+    total += nodes.last_stiffness[support] * wp.length_sq(last)
+    return wp.float64(0.5) * total / straight
+
+
+@wp.func
+def deflect_nodes(
+    support: int,
+    taut: wp.float64,
+    nodes: SupportNodes,
+    tree_awake: wp.array(dtype=wp.bool),
+    bodies: SupportedBodies,
+    springs: SupportedSprings,
+    state_out: SupportState,
+):
+    """Solve the static balance of one support by tridiagonal elimination: deflection, velocity and share of its nodes.
+
+    ``taut`` [1]: tension of a wire over its tension while it is straight; 1 for an arm.
     """
-    if wp.tid() >= count[0]:
-        return
-    support = supports[wp.tid()]
     first = nodes.first[support]
     end = nodes.first[support + 1]
     is_arm = nodes.is_arm[support]
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
-    left = nodes.stiffness[first]
+    left = taut * nodes.stiffness[first]
     ratio = zero
     deflection = wp.vec3d()
     velocity = wp.vec3d()
     share = zero
     for i in range(first, end):
-        right = nodes.last_stiffness[support]
-        if i + 1 < end:
-            right = nodes.stiffness[i + 1]
+        right = taut * stiffness_before(i + 1, support, nodes)
         stiffness = zero
         moved = wp.vec3d()
         motion = wp.vec3d()
         if is_arm:
             stiffness, moved, motion = pull_of_root(i, nodes, bodies)
         else:
-            stiffness = wp.float64(springs_out.stiffness[springs_out.span[nodes.body[i]][0] + nodes.number[i]])
+            stiffness = wp.float64(springs.stiffness[springs.span[nodes.body[i]][0] + nodes.number[i]])
             stiffness, moved, motion = pull_of_tie(i, stiffness, nodes, bodies)
             moved = moved + state_out.load[i]
         pivot = one / (left + right + stiffness - left * ratio)
@@ -246,6 +282,142 @@ def balance_supports(
         velocity = state_out.velocity[i] + ratio * velocity
         share = state_out.share[i] + ratio * share
         state_out.deflection[i] = deflection
+        state_out.velocity[i] = velocity
+        state_out.share[i] = share
+
+
+@wp.func
+def find_fall(
+    support: int,
+    taut: wp.float64,
+    straight: wp.float64,
+    nodes: SupportNodes,
+    springs: SupportedSprings,
+    state_out: SupportState,
+):
+    """Find the decrease of a wire's deflection per unit of its tension, at ``taut`` times its ``straight`` tension [N].
+
+    Returns the decrease of its length per unit of tension [m/N], and its change of length per second [m/s] with the
+    nodes' velocities at constant tension.
+    """
+    first = nodes.first[support]
+    end = nodes.first[support + 1]
+    zero = wp.float64(0.0)
+    left = taut * nodes.stiffness[first]
+    ratio = zero
+    fall = wp.vec3d()
+    for i in range(first, end):
+        right = taut * stiffness_before(i + 1, support, nodes)
+        stiffness = wp.float64(springs.stiffness[springs.span[nodes.body[i]][0] + nodes.number[i]])
+        pivot = wp.float64(1.0) / (left + right + stiffness - left * ratio)
+        fall = pivot * (kink(i, support, nodes, state_out.deflection) / straight + left * fall)
+        ratio = pivot * right
+        state_out.fall[i] = fall
+        left = right
+    fall = wp.vec3d()
+    shorter = zero
+    speed = zero
+    for j in range(end - first):
+        i = end - 1 - j
+        fall = state_out.fall[i] + state_out.ratio[i] * fall
+        state_out.fall[i] = fall
+        bend = kink(i, support, nodes, state_out.deflection) / straight
+        shorter = shorter + wp.dot(bend, fall)
+        speed = speed + wp.dot(bend, state_out.velocity[i])
+    return shorter, speed
+
+
+@wp.func
+def tighten(
+    support: int,
+    piece: int,
+    wires: Wires,
+    nodes: SupportNodes,
+    tree_awake: wp.array(dtype=wp.bool),
+    bodies: SupportedBodies,
+    springs: SupportedSprings,
+    state_out: SupportState,
+    tension_out: wp.array(dtype=wp.float64),
+    resistance_out: wp.array(dtype=wp.float64),
+):
+    """Find the tension of a wire that its deflection lengthens, by Newton's method, and its deflection with it.
+
+    The tension is the root of T - T_straight - stretch * lengthening(T), which grows with T. The nodes' velocities
+    include that of the tension.
+    """
+    one = wp.float64(1.0)
+    straight = wires.straight_tension[piece]
+    stretch = wires.stretch[piece]
+    tension = tension_out[piece]
+    resistance = wp.float64(0.0)
+    for turn in range(MOST_TURNS):
+        deflect_nodes(support, tension / straight, nodes, tree_awake, bodies, springs, state_out)
+        bulge = wires.bulge[piece] / (tension * tension)
+        longer = lengthening(support, straight, nodes, state_out.deflection) + bulge
+        missing = straight + stretch * longer - tension
+        if stretch * longer < LEAST_RISE * straight and wp.abs(missing) < LEAST_RISE * straight:
+            break
+        shorter, speed = find_fall(support, tension / straight, straight, nodes, springs, state_out)
+        resistance = stretch * (shorter + wp.float64(2.0) * bulge / tension)
+        step = missing / (one + resistance)
+        if wp.abs(step) < LEAST_RISE * tension or turn == MOST_TURNS - 1:
+            rise = stretch * speed / (one + resistance)
+            for i in range(nodes.first[support], nodes.first[support + 1]):
+                state_out.velocity[i] = state_out.velocity[i] - rise * state_out.fall[i]
+                state_out.deflection[i] = state_out.deflection[i] - step * state_out.fall[i]
+            tension = tension + step
+            break
+        tension = wp.max(tension + step, straight)
+    tension_out[piece] = tension
+    resistance_out[piece] = resistance
+
+
+@wp.kernel
+def balance_supports(
+    # model
+    wires: Wires,
+    nodes: SupportNodes,
+    # in
+    count: wp.array(dtype=wp.int32),
+    supports: wp.array(dtype=wp.int32),
+    tree_awake: wp.array(dtype=wp.bool),
+    is_placed: wp.array(dtype=wp.bool),
+    bodies: SupportedBodies,
+    # out
+    state_out: SupportState,
+    springs_out: SupportedSprings,
+    tension_out: wp.array(dtype=wp.float64),
+    resistance_out: wp.array(dtype=wp.float64),
+    is_moved_out: wp.array(dtype=wp.bool),
+    moved_count_out: wp.array(dtype=wp.int32),
+):
+    """One thread solves the static balance of one support (wire or arm) with the trees on it, by tridiagonal
+    elimination.
+
+    count: [1] number of supports; supports: [thread] index of the support; is_placed: [tree] sleeping trees that were
+    moved to another pose since the last step; state, springs: results at this support's nodes; tension, resistance:
+    [piece] those of ``wires``; is_moved: [tree] set for sleeping trees whose support has moved further than
+    ``wake_distance`` since they fell asleep; moved_count: [1] number of such trees.
+    """
+    if wp.tid() >= count[0]:
+        return
+    support = supports[wp.tid()]
+    first = nodes.first[support]
+    end = nodes.first[support + 1]
+    is_arm = nodes.is_arm[support]
+    piece = nodes.piece[support]
+    if not is_arm and wires.tension[piece] <= wp.float64(0.0):
+        for i in range(first, end):
+            state_out.deflection[i] = wp.vec3d()
+        return
+    if not is_arm and wires.stretch[piece] > wp.float64(0.0):
+        tighten(support, piece, wires, nodes, tree_awake, bodies, springs_out, state_out, tension_out, resistance_out)
+    else:
+        deflect_nodes(support, wp.float64(1.0), nodes, tree_awake, bodies, springs_out, state_out)
+    for i in range(first, end):
+        deflection = state_out.deflection[i]
+        velocity = state_out.velocity[i]
+        share = state_out.share[i]
         tree = nodes.tree[i]
         if is_arm:
             turn_rest(i, deflection[0], velocity[0], share, nodes, bodies, springs_out)
@@ -281,6 +453,7 @@ def in_series(a: wp.float64, b: wp.float64):
 def wire_spring(
     piece: int,
     x: wp.float64,
+    tension: wp.float64,
     least_share: wp.float64,
     wires: Wires,
     nodes: SupportNodes,
@@ -293,9 +466,10 @@ def wire_spring(
 
     Returns the stiffness across the wire [N/m]; the displacement of the point by the ties alone [m, world]; and the
     further displacement by ``loads`` [node] N [m, world], except loads between the two nodes next to the point.
-    ``least_share``: least distance of the point from a post or node, as a share of the wire's length.
+    ``tension`` [N]: tension of the wire. ``least_share``: least distance of the point from a post or node, as a share
+    of the wire's length.
     """
-    tension = wires.tension[piece]
+    taut = tension / wires.straight_tension[piece]
     length = wires.length[piece]
     least = least_share * length
     support = wires.support[piece]
@@ -311,7 +485,7 @@ def wire_spring(
     right_first = end
     for i in range(first, end):
         if wires.node_along[i] < x:
-            between = nodes.stiffness[i]
+            between = taut * nodes.stiffness[i]
             if i > first:
                 between = in_series(between, behind)
             stiffness, pull = pull_of_node(i, nodes, bodies, springs)
@@ -326,9 +500,9 @@ def wire_spring(
     right_deflection = wp.vec3d()
     for j in range(end - right_first):
         i = end - 1 - j
-        between = nodes.last_stiffness[support]
+        between = taut * nodes.last_stiffness[support]
         if j > 0:
-            between = in_series(nodes.stiffness[i + 1], behind)
+            between = in_series(taut * nodes.stiffness[i + 1], behind)
         stiffness, pull = pull_of_node(i, nodes, bodies, springs)
         behind = stiffness + between
         right_rest = (pull + between * right_rest) / behind

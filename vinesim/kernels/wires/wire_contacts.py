@@ -6,9 +6,20 @@ wire. :mod:`vinesim.wires.deflected_wires` describes the model.
 
 import warp as wp
 
-from vinesim.kernels.wires.elastic_supports import SupportedBodies, SupportedSprings, SupportNodes, Wires, wire_spring
+from vinesim.kernels.wires.elastic_supports import (
+    LEAST_RISE,
+    MOST_TURNS,
+    SupportedBodies,
+    SupportedSprings,
+    SupportNodes,
+    Wires,
+    wire_spring,
+)
 
 wp.set_module_options({"enable_backward": False})
+
+TENSION_STEP = wp.constant(wp.float64(1.0e-4))
+"""[1] Change of a wire's tension, as a share of it, that shows how its deflection depends on it."""
 
 
 @wp.struct
@@ -81,6 +92,7 @@ class WirePresses:
     normal: wp.array(dtype=wp.vec3d)
     place: wp.array(dtype=wp.vec3d)  # [m] displacement of the wire from its undeflected position
     force: wp.array(dtype=wp.float64)  # [N] force expected in the next step
+    pushed: wp.array(dtype=wp.float64)  # [N] force of the last step
     weight: wp.array(dtype=wp.float64)
     others: wp.array(dtype=wp.float64)
 
@@ -119,6 +131,56 @@ def deflection_between(piece: int, x: wp.float64, wires: Wires, nodes: SupportNo
             compliance = share / wp.max(wires.tension[piece] * (high - low), wp.float64(1.0e-12))
             found = found - compliance * presses.force[j] * presses.normal[j]
     return found
+
+
+@wp.func
+def bulge_of(piece: int, wires: Wires, nodes: SupportNodes, presses: WirePresses):
+    """Returns by how much presses lengthen a wire beyond the line through its nodes, times its tension squared [N^2
+    m]: half the sum of force times deflection times tension."""
+    total = wp.float64(0.0)
+    for j in range(presses.count[0]):
+        if presses.piece[j] == piece and presses.force[j] > wp.float64(0.0):
+            moved = deflection_between(piece, presses.along[j], wires, nodes, presses)
+            total = total - wp.float64(0.5) * wires.tension[piece] * presses.force[j] * wp.dot(presses.normal[j], moved)
+    return total
+
+
+@wp.func
+def tangent_stiffness(
+    i: int,
+    alone: wp.float64,
+    deflection: wp.vec3d,
+    between: wp.vec3d,
+    least_share: wp.float64,
+    wires: Wires,
+    nodes: SupportNodes,
+    bodies: SupportedBodies,
+    springs: SupportedSprings,
+    loads: wp.array(dtype=wp.vec3d),
+    contacts: WireContacts,
+):
+    """Returns the stiffness [N/m] by which the force of contact ``i`` grows, where the wire's tension grows as well.
+
+    alone: stiffness at constant tension; deflection: displacement of the point of contact, except the part
+    ``between`` the nodes, which falls as the tension grows.
+    """
+    piece = contacts.piece[i]
+    tension = wires.tension[piece]
+    if wires.resistance[piece] <= wp.float64(0.0):
+        return alone
+    more = TENSION_STEP * tension
+    _stiffness, rest, moved = wire_spring(
+        piece, contacts.along[i], tension + more, least_share, wires, nodes, bodies, springs, loads
+    )
+    fall = wp.dot((deflection - rest - moved) / more + between / tension, contacts.normal[i])
+    softer = wires.stretch[piece] * fall * fall / (wp.float64(1.0) + wires.resistance[piece])
+    return one_over(one_over(alone) - wp.min(softer, wp.float64(0.95) * one_over(alone)))
+
+
+@wp.func
+def one_over(x: wp.float64):
+    """Returns 1 / x."""
+    return wp.float64(1.0) / x
 
 
 @wp.func
@@ -223,12 +285,37 @@ def find_wire_springs(
         x = contacts_out.along[i]
         normal = contacts_out.normal[i]
         last = contacts_out.last[i]
-        alone, rest, deflection = wire_spring(piece, x, numbers.least_share, wires, nodes, bodies, springs, loads)
-        deflection = deflection + deflection_between(piece, x, wires, nodes, presses)
-        stiffness = alone / sharing(i, numbers, wires, contacts_out, presses)
         force = zero
         if last >= 0:
             force = presses.force[last]
+        if wires.tension[piece] <= zero:  # broken
+            contacts_out.stiffness[i] = one
+            contacts_out.shift[i] = numbers.out_of_reach
+            contacts_out.geom[i] = wp.vec3d()
+            contacts_out.place[i] = wp.vec3d()
+            contacts_out.last_force[i] = zero
+            contacts_out.others[i] = zero
+            continue
+        alone, rest, deflection = wire_spring(
+            piece, x, wires.tension[piece], numbers.least_share, wires, nodes, bodies, springs, loads
+        )
+        between = deflection_between(piece, x, wires, nodes, presses)
+        tangent = tangent_stiffness(
+            i,
+            alone,
+            rest + deflection,
+            between,
+            numbers.least_share,
+            wires,
+            nodes,
+            bodies,
+            springs,
+            loads,
+            contacts_out,
+        )
+        deflection = deflection + between
+        shared = sharing(i, numbers, wires, contacts_out, presses)
+        stiffness = alone / shared
         # deflection by other presses, plus deflection by this contact's own force
         now = wp.dot(deflection, normal) + force / stiffness
         mean = now
@@ -237,6 +324,9 @@ def find_wire_springs(
         share = x / wp.max(wires.length[piece], wp.float64(1.0e-9))
         geom = (one - share) * geoms.offset[piece, 0] + share * geoms.offset[piece, 1]
         shift = wp.dot(geom - rest, normal) - numbers.followed * now - (one - numbers.followed) * mean
+        # a spring of the tangent stiffness has the same force at the present place
+        shift = shift + force * (shared / alone - shared / tangent)
+        stiffness = tangent / shared
         if contacts_out.gap[i] > numbers.touching:
             shift = zero  # another press holds the wire away from this contact
         if wp.abs(wp.dot(normal, geoms.axis[piece])) > numbers.max_normal_along_wire:
@@ -286,6 +376,7 @@ def add_presses(
             found_out.normal[k] = contacts.normal[i]
             found_out.place[k] = place
             found_out.force[k] = expected
+            found_out.pushed[k] = force
             found_out.weight[k] = weight
             found_out.others[k] = contacts.others[i]
 
@@ -300,6 +391,7 @@ def copy_press(j: int, k: int, presses: WirePresses, presses_out: WirePresses):
     presses_out.normal[k] = presses.normal[j]
     presses_out.place[k] = presses.place[j]
     presses_out.force[k] = presses.force[j]
+    presses_out.pushed[k] = presses.pushed[j]
     presses_out.weight[k] = presses.weight[j]
     presses_out.others[k] = presses.others[j]
 
@@ -369,6 +461,32 @@ def rod_through(piece: int, first: int, numbers: WireNumbers, wires: Wires, pres
     geoms_out.offset[piece, 1] = end
 
 
+@wp.func
+def tighten_alone(
+    piece: int,
+    wires: Wires,
+    bulge: wp.array(dtype=wp.float64),
+    tension_out: wp.array(dtype=wp.float64),
+    resistance_out: wp.array(dtype=wp.float64),
+):
+    """Find the tension of a wire without ties under its presses, by Newton's method."""
+    straight = wires.straight_tension[piece]
+    stretch = wires.stretch[piece]
+    if stretch * bulge[piece] <= wp.float64(0.0) or tension_out[piece] <= wp.float64(0.0):
+        return
+    tension = straight
+    resistance = wp.float64(0.0)
+    for _turn in range(MOST_TURNS):
+        longer = bulge[piece] / (tension * tension)
+        resistance = wp.float64(2.0) * stretch * longer / tension
+        step = (straight + stretch * longer - tension) / (wp.float64(1.0) + resistance)
+        tension = tension + step
+        if step < LEAST_RISE * tension:
+            break
+    tension_out[piece] = tension
+    resistance_out[piece] = resistance
+
+
 @wp.kernel
 def deflect_wires(
     # model
@@ -384,6 +502,9 @@ def deflect_wires(
     loads_out: wp.array(dtype=wp.vec3d),
     is_loaded_out: wp.array(dtype=wp.bool),
     geoms_out: WireGeoms,
+    bulge_out: wp.array(dtype=wp.float64),
+    tension_out: wp.array(dtype=wp.float64),
+    resistance_out: wp.array(dtype=wp.float64),
 ):
     """The only thread updates the list of presses (forces on wires), the loads on the wires' nodes and the positions of
     the wires' geoms at the end of a step.
@@ -391,7 +512,8 @@ def deflect_wires(
     Presses of sleeping trees stay in the list. The geom of a wire without presses moves towards its undeflected
     position step by step. rigid_asleep: [kinematic tree of MuJoCo] not negative while the tree sleeps; found: presses
     of this step, whose count is set to 0; presses: list of the last step, overwritten with the list of this step;
-    loads: [node] N; is_loaded: [support].
+    loads: [node] N; is_loaded: [support]; bulge, tension,
+    resistance: [piece] see ``Wires``.
     """
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
@@ -406,7 +528,12 @@ def deflect_wires(
             copy_press(j, found_out.count[0], presses_out, found_out)
             found_out.count[0] = found_out.count[0] + 1
         load_nodes(j, zero, wires, nodes, presses_out, loads_out, is_loaded_out)
-        geoms_out.is_held[presses_out.piece[j]] = False
+        piece = presses_out.piece[j]
+        geoms_out.is_held[piece] = False
+        bulge_out[piece] = zero
+        if wires.support[piece] < 0:
+            tension_out[piece] = wp.min(tension_out[piece], wires.straight_tension[piece])
+            resistance_out[piece] = zero
     presses_out.count[0] = found_out.count[0]
     found_out.count[0] = 0
     loaded = int(0)
@@ -418,6 +545,12 @@ def deflect_wires(
                 geoms_out.loaded[loaded] = support
                 loaded = loaded + 1
         load_nodes(j, one, wires, nodes, presses_out, loads_out, is_loaded_out)
+    for j in range(presses_out.count[0]):
+        piece = presses_out.piece[j]
+        if bulge_out[piece] == zero:
+            bulge_out[piece] = bulge_of(piece, wires, nodes, presses_out)
+            if wires.support[piece] < 0:
+                tighten_alone(piece, wires, bulge_out, tension_out, resistance_out)
     kept = int(0)
     for k in range(geoms_out.count[0]):  # released wires return; wires that are still pressed are placed below
         piece = geoms_out.deflected[k]

@@ -132,7 +132,9 @@ class RetainedRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknow
     """Stumps that cuts of the tree's canes have left, in increasing order: body of the stump, segment that was cut, and
     place of the cut along it [0.1 mm]."""
     wood: bytes = b""
-    """For a tree whose wood or ties have given: encoded by :func:`vinesim.net.codec.wood.encode_wood`."""
+    """For a tree that has changed for good, besides cuts: encoded by :func:`vinesim.net.codec.wood.encode_wood`."""
+    fruit: tuple[float, float] | None = None
+    """For a bunch that was handled: expected numbers of its berries that burst and that were lost."""
 
     @property
     def claim(self) -> Claim:
@@ -270,6 +272,8 @@ def decode_records(payload: bytes, counts: tuple[int, ...] | None = None) -> lis
             raise MessageError(f"record of object {record.object} with impossible stumps {record.stumps[:4]}")
         if record.wood:
             decode_wood(record.wood)
+        if record.fruit is not None and not all(0.0 <= number < 1e5 for number in record.fruit):
+            raise MessageError(f"record of object {record.object} with an impossible number of berries {record.fruit}")
     return records
 
 

@@ -23,6 +23,7 @@ from vinesim.net.codec.human import decode_pose
 from vinesim.net.codec.messages import FAMILIES, MESSAGES, sender_of
 from vinesim.net.codec.objects import OBJECTS, ObjectStates, check_object_id, decode_objects
 from vinesim.net.codec.trees import RESTING, TOUCHED, TreeStates, decode_trees
+from vinesim.net.codec.wood import decode_wood
 from vinesim.net.replication.authority import NO_OWNER, Claim
 from vinesim.net.replication.interest import Cell
 from vinesim.net.replication.replication_state import SPECTATOR, ReplicationState, put_counted
@@ -30,7 +31,7 @@ from vinesim.net.transport.bus import Reply
 from vinesim.scene.ids import Organ, is_tree, parse_object_name
 from vinesim.scene.model import Model
 from vinesim.scene.spare_bodies import PLACE_STEP
-from vinesim.scene.values import HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpdate
+from vinesim.scene.values import GivenWood, HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpdate
 
 MAX_EARLY_MESSAGES = 100
 """Largest number of :class:`EarlyMessages` of one sender."""
@@ -330,7 +331,7 @@ def check_record(record: RetainedRecord, model: Model, counts: tuple[int, ...]) 
     """
     if is_tree(record.object):
         _check_tree_record(record, model)
-    elif record.cut or record.trees or record.stumps:
+    elif record.cut or record.trees or record.stumps or record.wood:
         raise MessageError(f"record of object {record.object} with cuts or the state of a tree; it is none")
     parent = parse_object_name(record.parent)
     if parent is not None:
@@ -349,11 +350,32 @@ def _check_tree_record(record: RetainedRecord, model: Model) -> None:
         raise MessageError(f"record of tree {tree} cut at body {wrong}; it has wood from {first} to {first + core - 1}")
     for stump, segment, place in record.stumps:
         _check_stump(record, stump, segment, PLACE_STEP * place, model)
+    if record.wood:
+        _check_wood(tree, decode_wood(record.wood), model)
     if record.trees:
         states = decode_trees(record.trees, model.tree_size)
         if states.tree.tolist() != [tree]:
             raise MessageError(f"record of tree {tree} with the state of {states.tree.tolist()}")
         check_tree_states(states, model)
+
+
+def _check_wood(tree: int, wood: GivenWood, model: Model) -> None:
+    """Raise :class:`MessageError` if a tree has no such joints, ties, segments or leaves."""
+    core = int(model.tree_core[tree])
+    ties = int((model.body_tree[model.tie_body] == tree).sum())
+    leaves = int((model.body_tree[model.leaf_body] == tree).sum())
+    for what, places, count in (
+        ("joint", wood.joints, core),
+        ("tie", wood.ties, ties),
+        ("notched segment", wood.notched, core),
+        ("tied segment", wood.tied, core),
+        ("leaf", wood.bare, leaves),
+    ):
+        if len(places) and int(places[-1]) >= count:
+            raise MessageError(f"record of tree {tree} with {what} {places[-1]}; it has {count}")
+    length = model.body_length[int(model.tree_first[tree]) + wood.tied]
+    if (PLACE_STEP * (wood.tied_at - 1) > length).any():
+        raise MessageError(f"record of tree {tree} with a tie beyond the end of its segment")
 
 
 def _check_stump(record: RetainedRecord, stump: int, segment: int, place: float, model: Model) -> None:

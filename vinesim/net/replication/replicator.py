@@ -224,6 +224,7 @@ class Replicator:
         stalk_of: Callable[[int], tuple[int, int] | None] = lambda _: None,
         stumps_of: Callable[[int], tuple[tuple[int, int, int], ...]] = lambda _: (),
         wood_of: Callable[[int], bytes] = lambda _: b"",
+        fruit_of: Callable[[int], tuple[float, float] | None] = lambda _: None,
     ) -> list[TreeUpdate]:
         """Publish the results of one step. Returns the states of trees at rest that were sent, as all receivers decode
         them.
@@ -250,6 +251,8 @@ class Replicator:
         * ``stumps_of(tree)``: the stumps of a tree (:attr:`vinesim.net.codec.control.RetainedRecord.stumps`).
         * ``wood_of(tree)``: how the wood and ties of a tree have given
           (:attr:`vinesim.net.codec.control.RetainedRecord.wood`).
+        * ``fruit_of(object_id)``: the berries that a bunch has lost
+          (:attr:`vinesim.net.codec.control.RetainedRecord.fruit`).
         """
         state = self._state
         self._follow_clock()
@@ -280,6 +283,7 @@ class Replicator:
                 stalk_of,
                 stumps_of,
                 wood_of,
+                fruit_of,
             )
         )
 

@@ -3,9 +3,10 @@
 A last-writer-wins map. Merging is a join of a semilattice: equal sets of records result in equal maps, in whatever
 order and however often the records arrive. Of two records of one object the one with the greater claim is kept
 (:func:`authority.wins`). An author therefore never publishes two different records with the same claim. Cuts
-accumulate: the record that is kept also takes over the cuts and stumps of the other one. If two records name the same
-body as stumps of different cuts, the lower segment and the lower place are kept. The server keeps one map for each
-world, and every client keeps a map of the records that it has received.
+accumulate: the record that is kept also takes over the cuts and stumps of the other one, what else has changed the tree
+(:func:`vinesim.net.codec.wood.joined_wood`), and the berries that a bunch has lost. If two records name the same body
+as stumps of different cuts, the lower segment and the lower place are kept. The server keeps one map for each world,
+and every client keeps a map of the records that it has received.
 Source: M. Shapiro et al., Conflict-free Replicated Data Types, 2011.
 """
 
@@ -16,6 +17,7 @@ from collections.abc import Iterator
 import msgspec
 
 from vinesim.net.codec.control import RetainedRecord
+from vinesim.net.codec.wood import joined_wood
 from vinesim.net.replication import authority
 from vinesim.net.replication.interest import Cell
 
@@ -35,15 +37,18 @@ class RetainedState:
             return True
         cuts = tuple(sorted({*held.cut, *record.cut}))
         stumps = _joined_stumps(held.stumps, record.stumps)
+        wood = joined_wood(held.wood, record.wood)
+        fruit = _joined_fruit(held.fruit, record.fruit)
+        joined = cuts, stumps, wood, fruit
         if authority.wins(record.claim, held.claim):
             self._records[self._cell_of[record.object]].pop(record.object)
-        elif (cuts, stumps) != (held.cut, held.stumps):
+        elif joined != (held.cut, held.stumps, held.wood, held.fruit):
             cell = self._cell_of[record.object]
             record = held
         else:
             return False
-        if (cuts, stumps) != (record.cut, record.stumps):
-            record = msgspec.structs.replace(record, cut=cuts, stumps=stumps)
+        if joined != (record.cut, record.stumps, record.wood, record.fruit):
+            record = msgspec.structs.replace(record, cut=cuts, stumps=stumps, wood=wood, fruit=fruit)
         self._put(cell, record)
         return True
 
@@ -69,6 +74,13 @@ class RetainedState:
     def _put(self, cell: Cell, record: RetainedRecord) -> None:
         self._cell_of[record.object] = cell
         self._records.setdefault(cell, {})[record.object] = record
+
+
+def _joined_fruit(one: tuple[float, float] | None, other: tuple[float, float] | None) -> tuple[float, float] | None:
+    """Returns the greater numbers of burst and of lost berries of two records."""
+    if one is None or other is None:
+        return one if other is None else other
+    return max(one[0], other[0]), max(one[1], other[1])
 
 
 def _joined_stumps(

@@ -58,9 +58,12 @@ class RetainedSync:
         is_new = self.state.merge(cell, record)
         if is_new and record.author != self.bus.name:
             held = self.state.get(record.object)
-            if held is not None and held.author != self.bus.name and record.object in self._authored:
+            if held is not None and record.object in self._authored:
                 cell_before, _ = self._authored.pop(record.object)
-                self._pending.get(cell_before, {}).pop(record.object, None)
+                if held.author == self.bus.name:  # it has taken over the other one's cuts
+                    self._authored[record.object] = cell_before, held
+                else:
+                    self._pending.get(cell_before, {}).pop(record.object, None)
         return is_new
 
     def update_window(self, window: Collection[Cell], changes: int, now: float) -> None:
@@ -116,7 +119,7 @@ class RetainedSync:
                 batch = []
                 free_bytes = MAX_DATAGRAM
                 for object_id in sorted(waiting):
-                    free_bytes -= TYPICAL_RECORD_SIZE + len(waiting[object_id].trees)
+                    free_bytes -= TYPICAL_RECORD_SIZE + len(waiting[object_id].trees) + len(waiting[object_id].wood)
                     if free_bytes < 0 and batch:
                         break
                     batch.append(object_id)

@@ -60,6 +60,7 @@ class LocalStep:
     stalk_of: Callable[[int], tuple[int, int] | None]
     stumps_of: Callable[[int], tuple[tuple[int, int, int], ...]]
     wood_of: Callable[[int], bytes]
+    fruit_of: Callable[[int], tuple[float, float] | None]
 
 
 class Sender:
@@ -325,7 +326,7 @@ class Sender:
         record = RetainedRecord(
             object_id, claim.ownership, claim.authority, state.hello.name, _within_range(pose), parent
         )
-        record = msgspec.structs.replace(record, stalk=step.stalk_of(object_id))
+        record = msgspec.structs.replace(record, stalk=step.stalk_of(object_id), fruit=step.fruit_of(object_id))
         if parent and parse_object_name(parent) is None:
             record = msgspec.structs.replace(record, place=_within_range(step.read(object_id)[0]))
         state.retained.publish(state.object_stream.cells((object_id,))[0], record)
@@ -343,7 +344,9 @@ class Sender:
             return
         state.object_stream.positions((object_id,), step.read)
         pose, _ = step.read(object_id)
-        record = msgspec.structs.replace(record, pose=_within_range(pose), stalk=step.stalk_of(object_id))
+        record = msgspec.structs.replace(
+            record, pose=_within_range(pose), stalk=step.stalk_of(object_id), fruit=step.fruit_of(object_id)
+        )
         state.retained.publish(state.object_stream.cells((object_id,))[0], record)
 
     def _publish_tree_record(self, cell: Cell, record: RetainedRecord, step: LocalStep) -> None:

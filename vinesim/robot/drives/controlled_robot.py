@@ -103,6 +103,22 @@ class Robot(RobotInstance):
             )
             self._cutters.setdefault(cutter.group, []).append(blade)
 
+    def work_on_plant(self, what: str) -> str:
+        """Tie, untie or strip the wood at the mouth of the robot's cutter that is nearest to wood; see
+        :meth:`vinesim.interaction.handwork.Handwork.work_at`. Call this between steps. Returns what was done. Raises
+        :class:`CommandError` if the robot has no cutter, or there is nothing to do within reach."""
+        blades = [blade for blades in self._cutters.values() for blade in blades]
+        if not blades:
+            raise CommandError(f"{self.name} has no cutter at which it could work on plants")
+        failed = ""
+        for blade in blades:
+            mouth = frames.compose(self.rigid.link_pose(self.name, blade.link), blade.pose)
+            try:
+                return self.physics.handwork.work_at(what, mouth[:3], self.name)
+            except ValueError as reason:
+                failed = failed or str(reason)
+        raise CommandError(f"{self.name}: {failed}")
+
     def remove(self) -> None:
         """Remove the robot and its cutters from the world."""
         if self._physics is not None:

@@ -29,15 +29,27 @@ from vinesim.robot.tasks.task import Task, TaskFailed
 from vinesim.world import Physics
 
 STALK_LENGTH = 0.012
-"""[m] Length of the stalk that stays on the bunch."""
+"""[m] Least length of the stalk that stays on the bunch; see :func:`stalk_length`."""
+SHOULDER = -0.032, 0.916, -0.106
+"""[m, 1, 1] Height of a bunch's shoulders above its upper end, 20 mm beside the stalk, where the bars of the cutter
+pass: a constant, and shares of its radius and of its length. DERIVED: least squares over the collision shapes of the
+199 bunches of ``demo`` (seed 0) and ``harvest`` (seed 7), right within 2.7 mm."""
+SHOULDER_ROOM = 0.009
+"""[m] Distance of the cutter's plane above the shoulders: half a bar (3 mm), the error of :data:`SHOULDER`, and the
+error of the hand (3 mm)."""
+STALK_FORCE = 150.0
+"""[N] Largest force of the blades at a stalk. Peduncles of 3 to 5.6 mm take 34 to 118 N
+(:data:`vinesim.interaction.cutting_force.PEDUNCLE_STRENGTH`). Blades with this force stall in canes of 3.8 mm and
+more."""
 OPENING_MARGIN = 0.015
 """[m] Gap between the open fingers and the bunch, on each side. GUESSED"""
 APPROACH_DISTANCE = 0.20
 """[m] Length of the straight motion towards the bunch before the grasp, and of the straight motion back after it.
 GUESSED"""
-GRASP_FORCE = 25.0
-"""[N] Force of each finger. A bunch of 1 kg needs 6 N at a friction coefficient of 0.8; the rest is for
-accelerations."""
+GRASP_FORCE = 15.0
+"""[N] Force of each finger. A bunch of 1 kg needs 6 N at a friction coefficient of 0.8; the rest is for accelerations.
+More would burst berries: on one cell of a bunch, the weakest of a table grape burst from 16 N on
+(:data:`vinesim.interaction.fruit_damage.SKIN_TENSION`)."""
 MIN_GRASP_FORCE = 8.0
 """[N] Contact force on each finger from which on the fingers have grasped something. GUESSED"""
 GRASP_TIME = 0.3
@@ -69,6 +81,13 @@ MAX_MISS = 0.06
 """[m] Horizontal distance from its place in the box within which a hand that came no lower lets a bunch go. GUESSED"""
 MAX_SLIP = 0.12
 """[m] Distance between bunch and hand above which the bunch has slipped out of the fingers. GUESSED"""
+
+
+def stalk_length(radius: float, length: float) -> float:
+    """Returns the length [m] of the stalk to leave on a bunch of this ``radius`` and ``length`` [m]: the bars of the
+    cutter pass above its shoulders."""
+    constant, of_radius, of_length = SHOULDER
+    return max(STALK_LENGTH, constant + of_radius * radius + of_length * length + SHOULDER_ROOM)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,13 +128,12 @@ class PickBunch(Task):
         if cutter is None:
             raise CommandError(f"{robot.name} has no gripper with a cutter on its {plan.side} arm; give another robot")
         self._cutter = cutter.frame
-        self._length, self._radius = self._size()
+        self._above = float(np.linalg.norm(robot.frame_pose(self._cutter)[:3] - robot.frame_pose(self.arm.tool)[:3]))
+        """[m] Distance of the cutter above the point between the fingers."""
+        self._measure()
         self._is_empty = False
         """Whether the hand is to hold no bunch any more, after a failure."""
         self._fingers = robot.description.joint_indices(self.arm.gripper)
-        above = np.linalg.norm(robot.frame_pose(self._cutter)[:3] - robot.frame_pose(self.arm.tool)[:3])
-        self._grasp_depth = min(float(above) - STALK_LENGTH, 0.6 * self._length)
-        """[m] Distance from the upper end of the bunch down to the point where it is grasped."""
         self._tool_z = np.array([0.0, 0.0, 1.0])
 
     @property
@@ -138,6 +156,13 @@ class PickBunch(Task):
         """Returns length and radius of the bunch [m]."""
         model = self.physics.model
         return float(model.bunch_length[self.plan.bunch]), float(model.bunch_radius[self.plan.bunch])
+
+    def _measure(self) -> None:
+        """Set the size of the bunch, and where it is grasped."""
+        self._length, self._radius = self._size()
+        stalk = stalk_length(self._radius, self._length)
+        self._grasp_depth = min(self._above - stalk, 0.6 * self._length)
+        """[m] Distance from the upper end of the bunch down to the point where it is grasped."""
 
     @property
     def mass(self) -> float:
@@ -233,7 +258,7 @@ class PickBunch(Task):
     def _cut(self) -> Iterator[str]:
         """Close the cutter, repeatedly until the bunch is cut off."""
         for _ in range(MAX_CUTS):
-            self.robot.command_cutter(self.arm.gripper)
+            self.robot.command_cutter(self.arm.gripper, STALK_FORCE)
             yield "cut"
             while any(blade.closing for blade in self.robot.cutter_blades(self.arm.gripper)):
                 yield "cut"

@@ -13,7 +13,7 @@ import numpy as np
 
 from vinesim.core import frames
 from vinesim.robot.drives.controlled_robot import Robot
-from vinesim.robot.tasks.pick import OPENING_MARGIN, PickBunch, PickPlan
+from vinesim.robot.tasks.pick import OPENING_MARGIN, STALK_FORCE, PickBunch, PickPlan
 from vinesim.robot.tasks.sight import Eyes, SeenBunch
 from vinesim.robot.tasks.task import Task, TaskFailed
 from vinesim.scene.values import CameraMount
@@ -22,8 +22,6 @@ from vinesim.world import Physics
 OFFSETS = ((0.014, 0.004), (0.036, 0.016), (0.014, -0.008), (0.036, 0.032))
 """[m] Places of the hand that are tried one after the other: ahead of the estimated axis of the bunch, and above the
 usual place. The hand goes a little too far, since it pushes the bunch away. TUNED on seed 0 of scene demo"""
-STALK_FORCE = 300.0
-"""[N] Largest force of the blades: peduncles need 170 to 260 N, most canes more."""
 HELD_FORCE = 1.0
 """[N] Contact force on each finger below which the hand has lost what it held. GUESSED"""
 LOST_STEPS = 20
@@ -142,7 +140,7 @@ class PickSeenBunch(PickBunch):
         ]
         if near:
             self.seen = min(near, key=lambda one: float(np.linalg.norm((one.top - self.seen.top)[:2])))
-            self._length, self._radius = self._size()
+            self._measure()
 
     def _reach_and_cut(self, ahead: np.ndarray) -> Iterator[str]:
         """As in :class:`PickBunch`, at several places of the hand until the blades meet a stalk."""

@@ -12,12 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from vinesim.contact.bud_forces import bud_forces
 from vinesim.core import frames
 from vinesim.interaction.detachment import Blade
 from vinesim.robot.control.cartesian_controller import CartesianController, axes_of_pose
 from vinesim.robot.control.waypoint_follower import WaypointFollower
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.drives.joint_servos import CommandError
+from vinesim.robot.tasks.mouth_place import ENOUGH, MouthPlace, Wood, WoodAround, hand_shape, mouth_place
 from vinesim.robot.tasks.task import Task, TaskFailed
 from vinesim.scene.values import Detachment
 from vinesim.world import Physics
@@ -26,26 +28,29 @@ APPROACH = 0.18
 """[m] Length of the straight motion towards the cane, and back. GUESSED"""
 OPENING = 0.15
 """[m] Opening of the fingers, which pass beside the cane."""
-REACHED = 0.004
+REACHED = 0.003
 """[m] Distance from its place at which the mouth closes."""
-NEAR_ENOUGH = 0.012
-"""[m] Distance from its place at which a mouth that is held up closes nevertheless."""
+NEAR_ENOUGH = 0.006
+"""[m] Distance across the blades within which a mouth that is held up closes nevertheless."""
+MOUTH_MARGIN = 0.002
+"""[m] Distance from the edge of the mouth that the wood must have then."""
 TURNED = 0.25
-"""[rad] Error of the hand's orientation at which the mouth may close."""
-MAX_SHIFT = 0.012
-"""[m] Largest distance of a cane from the middle of the mouth, which is 40 mm wide."""
-MOUTH = 0.040
-"""[m] Width of the mouth."""
-BAR = 0.023
-"""[m] Distance of the bars beside the mouth from its middle."""
-BAR_ROOM = 0.013
-"""[m] Distance between the axes of a bar and of a cane within which they may touch."""
-REACH_OF_BLADES = 0.035
-"""[m] Distance ahead of and behind the middle of the mouth within which wood may be caught."""
-LENGTH_OF_BARS = 0.10
-"""[m] Distance behind the middle of the mouth up to which its bars reach."""
+"""[rad] Error of the hand's orientation at which it makes the last part of the way."""
+SLOW = 0.03
+"""[m/s] Speed of the hand on the :data:`LAST_WAY` where there is little room beside the mouth. GUESSED: 0.3 mm in
+a step."""
+LAST_WAY = 0.05
+"""[m] Length of the last part of the way, which begins when the hand has turned: the bars are beside the cane then."""
+TOUCH = 0.5
+"""[N] Force on a bud that stays at which the hand stops."""
+IN_LINE = 0.008
+"""[m] Distance from its start at which the straight motion towards the cane begins."""
 MAX_CLOSURES = 3
 """Number of times that the blades close for one cut."""
+MAX_TRIES = 2
+"""Number of directions from which one cut is tried."""
+NEAR_STOP = 0.4
+"""[m] Distance from a stop up to which its cuts are made from another one. GUESSED"""
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
@@ -63,25 +68,6 @@ class WoodCut:
     """[3] Direction of the hand, level."""
 
 
-def mouth_shift(off: np.ndarray, is_kept: np.ndarray, ahead: np.ndarray) -> float:
-    """Returns how far to the left of a cane the middle of the mouth is to be [m], so that no other cane is in the mouth
-    and canes that stay do not touch its bars.
-
-    ``off`` [n, 3] m: other canes at the height of the cut, seen from the cane. ``is_kept`` [n]: whether they stay.
-    ``ahead`` [3]: direction of the hand.
-    """
-    left = frames.cross(np.array([0.0, 0.0, 1.0]), ahead)
-    shifts = np.linspace(-MAX_SHIFT, MAX_SHIFT, 13)
-    beside = np.abs((off @ left)[:, None] - shifts)
-    along = (off @ ahead)[:, None]
-    caught = (beside < 0.5 * MOUTH + REACHED) & (np.abs(along) < REACH_OF_BLADES)
-    press = np.clip(1.0 - np.abs(beside - BAR) / BAR_ROOM, 0.0, None)
-    press = np.where((along > -LENGTH_OF_BARS) & (along < REACH_OF_BLADES), press, 0.0)
-    weight = np.where(is_kept, 1.0, 0.01)[:, None]
-    cost = (weight * (100.0 * caught + 10.0 * press)).sum(0) + np.abs(shifts)
-    return float(shifts[int(np.argmin(cost))])
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class PruneStop:
     """A place of the base, and the cuts that are made there."""
@@ -89,6 +75,11 @@ class PruneStop:
     base_pose: np.ndarray
     """[7] Pose of the base, the row to its left."""
     cuts: tuple[WoodCut, ...]
+
+
+def _apart(one: PruneStop, other: PruneStop) -> float:
+    """Returns the distance of two stops [m]."""
+    return float(np.linalg.norm((one.base_pose - other.base_pose)[:2]))
 
 
 @dataclasses.dataclass
@@ -129,9 +120,19 @@ class PruneCanes(Task):
         mouth = frames.compose(robot.frame_pose(cutter.frame), frames.pose(cutter.origin))
         self._mouth = frames.compose(frames.inverse(tool), mouth)[:3]
         """[3] m, middle of the mouth in the frame of the tool."""
-        self._shift = 0.0
-        """Distance of the middle of the mouth from the present cane, to the left of the hand [m]."""
-        self._kept = {cut.cane for stop in self.stops for cut in stop.cuts if cut.is_kept}
+        self._mouth_pose = cutter.frame, frames.pose(cutter.origin)
+        self._half = np.array(cutter.half)
+        fingers = robot.description.groups[self.arm.gripper].joints
+        moving = robot.description.moving_joints
+        links = [moving.frames[moving.names.index(joint)][1] for joint in fingers]
+        base = moving.frames[moving.names.index(fingers[0])][0]
+        self._hand_links = tuple(dict.fromkeys([*links, base, cutter.frame]))
+        self._at = MouthPlace(np.array([1.0, 0.0, 0.0]), 0.0, 0.0, 0.0, catches=False, cost=0.0)
+        """How the mouth takes the present cane."""
+        self._wood = WoodAround(physics.model)
+        self._kept = {cut.cane: self._from_base(cut) for stop in self.stops for cut in stop.cuts if cut.is_kept}
+        """[m] For each cane that is to be shortened: the way along it that stays."""
+        self._kept_buds = self._buds_that_stay()
         self._focus = frames.compose(robot.rigid.base_state(robot.name)[0], frames.pose([1.0, 1.0, 1.0]))[:3]
 
     def focus(self) -> np.ndarray:
@@ -150,24 +151,38 @@ class PruneCanes(Task):
         }
 
     def run(self) -> Iterator[str]:
-        """The task. It fails if a cut was not made."""
-        for stop in self.stops:
+        """The task. A cut waits while a cane that is to be cut off would be in the mouth, too: it is made from a later
+        stop, as long as one is near enough. The task fails if a cut was not made."""
+        waiting: list[tuple[PruneStop, WoodCut]] = []
+        for number, stop in enumerate(self.stops):
             yield from self._go_to(stop.base_pose)
-            for cut in stop.cuts:
-                start = self.time
-                off, reason = float("nan"), ""
-                try:
-                    yield from self._make(cut)
-                    off = self._error(cut)
-                except TaskFailed as failure:
-                    reason = f"{self.phase}: {failure}"
-                yield from self._withdraw(cut)
-                self.results.append(
-                    CutResult(cut.cane, cut.is_kept, not reason, off, round(self.time - start, 2), reason)
-                )
+            after = self.stops[number + 1] if number + 1 < len(self.stops) else None
+            for one in [*waiting, *((stop, cut) for cut in stop.cuts)]:
+                can_wait = after is not None and _apart(one[0], after) < NEAR_STOP
+                place = self._plan(one[1])
+                if can_wait and place.catches:
+                    if one not in waiting:
+                        waiting.append(one)
+                    continue
+                if one in waiting:
+                    waiting.remove(one)
+                yield from self._record(one[1], place)
         missed = [one for one in self.results if not one.done]
         if missed:
             raise TaskFailed(f"{len(missed)} of {len(self.results)} cuts were not made; the first: {missed[0].reason}")
+
+    def _record(self, cut: WoodCut, place: MouthPlace) -> Iterator[str]:
+        """Make a cut from ``place``, draw the hand back, and add what became of it to the results."""
+        start = self.time
+        off = float("nan")
+        reason = ""
+        try:
+            yield from self._make(cut, place)
+            off = self._error(cut)
+        except TaskFailed as failure:
+            reason = f"{self.phase}: {failure}"
+        yield from self._withdraw()
+        self.results.append(CutResult(cut.cane, cut.is_kept, not reason, off, round(self.time - start, 2), reason))
 
     def _go_to(self, place: np.ndarray) -> Iterator[str]:
         """Drive along the row to a pose [7] of the base."""
@@ -182,18 +197,37 @@ class PruneCanes(Task):
                 raise TaskFailed("the base is stuck")
             yield "go"
 
-    def _make(self, cut: WoodCut) -> Iterator[str]:
+    def _make(self, cut: WoodCut, place: MouthPlace) -> Iterator[str]:
+        """Make a cut from ``place``, from another direction if that is in vain."""
+        tried: list[np.ndarray] = []
+        while True:
+            try:
+                yield from self._try(cut, place)
+            except TaskFailed:
+                tried.append(place.ahead)
+                if len(tried) >= MAX_TRIES:
+                    raise
+                yield from self._withdraw()
+                place = self._plan(cut, tried)
+            else:
+                return
+
+    def _try(self, cut: WoodCut, place: MouthPlace) -> Iterator[str]:
         """Bring the mouth around the cane and close it."""
         self.robot.command_gripper(self.arm.gripper, OPENING)
+        self._at = place
         self._focus = self._place(cut)
-        self._shift = mouth_shift(*self._neighbours(cut), cut.ahead)
         yield from self._move(
-            "reach", lambda: self._tip(cut) - APPROACH * cut.ahead, cut, speed=0.35, timeout=10.0, near=0.02
+            "reach", lambda: self._tip(cut) - APPROACH * self._at.ahead, speed=0.35, timeout=10.0, near=IN_LINE
         )
         try:
-            yield from self._move("advance", lambda: self._tip(cut), cut, speed=0.10, timeout=4.0, near=REACHED)
+            yield from self._move(
+                "advance", lambda: self._tip(cut) - LAST_WAY * place.ahead, speed=0.20, timeout=5.0, near=IN_LINE
+            )
+            speed = SLOW if place.cost > ENOUGH else 0.10
+            yield from self._move("advance", lambda: self._tip(cut), speed=speed, timeout=4.0, near=REACHED)
         except TaskFailed:
-            if self.arm.distance_to(self._tip(cut)) > NEAR_ENOUGH:
+            if not self._is_in_mouth(cut):
                 raise
         blades = self.robot.cutter_blades(self.arm.gripper)
         for _ in range(MAX_CLOSURES):
@@ -211,16 +245,28 @@ class PruneCanes(Task):
             f"the blades did not cut the cane: its wood needs {strongest:.0f} N, 0: it is not in the mouth"
         )
 
-    def _withdraw(self, cut: WoodCut) -> Iterator[str]:
+    def _plan(self, cut: WoodCut, tried: Sequence[np.ndarray] = ()) -> MouthPlace:
+        """Returns how the mouth takes a cane, among the wood around it as it is now."""
+        wood = self._wood.around(self.physics.state, self._pose(cut), cut.cane, self._kept)
+        return self._place_of_mouth(cut, wood, tried)
+
+    def _place_of_mouth(self, cut: WoodCut, wood: Wood, tried: Sequence[np.ndarray]) -> MouthPlace:
+        """Returns how the mouth takes a cane among other ``wood``."""
+        link, offset = self._mouth_pose
+        mouth = frames.compose(self.robot.frame_pose(link), offset)
+        hand = hand_shape(self.robot.rigid, self.robot.name, self._hand_links, mouth, self._half)
+        return mouth_place(wood, hand, cut.ahead, APPROACH, tried)
+
+    def _withdraw(self) -> Iterator[str]:
         """Draw the hand back the way it came; a hand that is held stays where it is."""
-        back = self.arm.tip_position - APPROACH * cut.ahead
+        back = self.arm.tip_position - APPROACH * self._at.ahead
         try:
-            yield from self._move("back", lambda: back, cut, speed=0.25, timeout=4.0, near=0.04)
+            yield from self._move("back", lambda: back, speed=0.25, timeout=4.0, near=0.04)
         except TaskFailed:
             return
 
     def _move(
-        self, phase: str, goal: Callable[[], np.ndarray], cut: WoodCut, *, speed: float, timeout: float, near: float
+        self, phase: str, goal: Callable[[], np.ndarray], *, speed: float, timeout: float, near: float
     ) -> Iterator[str]:
         """Move the hand to ``goal`` [3] m in the world with its blades down."""
         end = self.time + timeout
@@ -228,47 +274,64 @@ class PruneCanes(Task):
         while True:
             there = goal()
             axes = axes_of_pose(self.robot.frame_pose(self.arm.tool))
-            off = float(np.arccos(np.clip((axes[0] @ cut.ahead + axes[2] @ DOWN) / 2.0, -1.0, 1.0)))
+            off = float(np.arccos(np.clip((axes[0] @ self._at.ahead + axes[2] @ DOWN) / 2.0, -1.0, 1.0)))
             if self.arm.distance_to(there) < near and (off < TURNED or phase != "advance"):
                 return
+            if phase == "advance" and self._bud_force() > TOUCH:
+                raise TaskFailed("a bud that stays is touched")
             if self.time > end:
                 raise TaskFailed(
                     f"the hand is {self.arm.distance_to(there):.3f} m and {off:.2f} rad off: out of reach, or held"
                 )
-            self.arm.move_towards(there, cut.ahead, DOWN, speed=speed, working_height=float(there[2]))
+            self.arm.move_towards(there, self._at.ahead, DOWN, speed=speed, working_height=float(there[2]))
             yield phase
+
+    def _is_in_mouth(self, cut: WoodCut) -> bool:
+        """Returns whether the wanted place is between the blades."""
+        link, offset = self._mouth_pose
+        mouth = frames.compose(self.robot.frame_pose(link), offset)
+        at = frames.rotate(frames.conjugate(mouth[3:]), self._place(cut) - mouth[:3])
+        room = np.array([-MOUTH_MARGIN, -MOUTH_MARGIN, NEAR_ENOUGH])
+        return bool((np.abs(at) < self._half + room).all())
+
+    def _buds_that_stay(self) -> np.ndarray:
+        """Returns the ids of the buds below the cuts of canes that are shortened [k]."""
+        nodes = self.physics.model.nodes
+        found = [np.zeros(0, int)]
+        for cut in (cut for stop in self.stops for cut in stop.cuts if cut.is_kept):
+            before = (nodes.body < cut.body) | ((nodes.body == cut.body) & (nodes.along < cut.along))
+            found.append(nodes.bud[(nodes.cane == cut.cane) & (nodes.bud >= 0) & before])
+        return np.concatenate(found)
+
+    def _bud_force(self) -> float:
+        """Returns the largest force [N] on a bud that stays, in the last step."""
+        physics = self.physics
+        touching = [one for one in physics.contacts if one.body >= 0]
+        if not touching or not len(self._kept_buds):
+            return 0.0
+        return float(bud_forces(physics.model, physics.state, touching)[self._kept_buds].max())
 
     def _tip(self, cut: WoodCut) -> np.ndarray:
         """Returns the place [3] m of the tool at which the cut is in the mouth."""
-        left = frames.cross(np.array([0.0, 0.0, 1.0]), cut.ahead)
-        # with the blades down the hand's y axis points to the right
-        mouth = self._mouth[0] * cut.ahead - self._mouth[1] * left - self._mouth[2] * np.array([0.0, 0.0, 1.0])
-        return self._place(cut) + self._shift * left - mouth
+        ahead = self._at.ahead
+        right = frames.cross(ahead, -DOWN)
+        mouth = frames.rotate(self.robot.frame_pose(self.arm.tool)[3:], self._mouth)  # as the hand is turned now
+        return self._place(cut) - self._at.depth * ahead - self._at.side * right - mouth
 
     def _place(self, cut: WoodCut) -> np.ndarray:
-        """Returns where the cut is wanted [3] m in the world."""
+        """Returns where the cut is made [3] m in the world."""
+        return frames.compose(self._pose(cut), frames.pose([self._at.slide, 0.0, 0.0]))[:3]
+
+    def _pose(self, cut: WoodCut) -> np.ndarray:
+        """Returns where the cut is wanted [7] in the world, the x axis along the cane."""
         self.physics.update_kinematics()
         pose = self.physics.state.body_q[self._carrier(cut)].astype(float)
-        return frames.compose(pose, frames.pose([cut.along, 0.0, 0.0]))[:3]
+        return frames.compose(pose, frames.pose([cut.along, 0.0, 0.0]))
 
-    def _neighbours(self, cut: WoodCut) -> tuple[np.ndarray, np.ndarray]:
-        """Returns where other canes are at the height of a cut, seen from it [n, 3] m, and whether each stays [n]."""
-        here = self._place(cut)
-        nodes = self.physics.model.nodes
-        state = self.physics.state
-        places = nodes.positions(state.body_q, nodes.carriers(state.stump_of, state.stump_end))
-        near = (np.linalg.norm((places - here)[:, :2], axis=1) < 0.3) & (np.abs(places[:, 2] - here[2]) < 0.2)
-        near &= self.physics.model.canes.year[nodes.cane] == 1
-        off: list[list[float]] = []
-        kept: list[bool] = []
-        for cane in np.unique(nodes.cane[near]).tolist():
-            mine = places[near & (nodes.cane == cane)]
-            mine = mine[np.argsort(mine[:, 2])]
-            # a stub has its lowest node above the height of a cut near its base
-            if cane != cut.cane and mine[0, 2] - 0.05 < here[2] < mine[-1, 2] + 0.02:
-                off.append([float(np.interp(here[2], mine[:, 2], mine[:, axis])) for axis in (0, 1)] + [float(here[2])])
-                kept.append(cane in self._kept)
-        return np.array(off).reshape(-1, 3) - here, np.array(kept, bool)
+    def _from_base(self, cut: WoodCut) -> float:
+        """Returns the way [m] along the cane from its base to the wanted place."""
+        model = self.physics.model
+        return float(model.body_length[int(model.canes.body[cut.cane]) : cut.body].sum()) + cut.along
 
     def _carrier(self, cut: WoodCut) -> int:
         """Returns the body that has the wanted place: the cane's, or the stump of an earlier cut beyond it."""
@@ -289,7 +352,7 @@ class PruneCanes(Task):
         state = self.physics.state
         first = int(model.canes.body[cut.cane])
         end = first + int(model.canes.size[cut.cane])
-        wanted = float(model.body_length[first : cut.body].sum()) + cut.along
+        wanted = self._from_base(cut)
         for one in detachments:
             body = one.segment if one.segment >= 0 else one.body
             body = int(state.stump_of[body]) if state.stump_of[body] >= 0 else body

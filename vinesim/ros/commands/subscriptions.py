@@ -26,6 +26,7 @@ from vinesim.ros.commands.types import (
     LightsColor,
     LightsPattern,
     LightsSound,
+    PlantWork,
 )
 from vinesim.ros.topic import RELIABLE
 from vinesim.scene.values import FORWARD_KINDS, ControllerKind, ControllerSpec
@@ -117,6 +118,7 @@ class CommandSubscriptions:
         self.types: dict[str, str] = {}
         """Accepted message type (``package/msg/Name``) by full name of the topic."""
         self._subscribe(TwistStamped, BASE_COMMAND, convert.base_velocity)
+        self._subscribe(String, "plant_work/command", lambda message: PlantWork(message.data.strip()))
         self._subscribe(String, "indicator_lights/command", convert.lights_pattern)
         self._subscribe(ColorRGBA, "indicator_lights/color", convert.lights_color)
         self._subscribe(Bool, "indicator_lights/sound", lambda message: LightsSound(message.data))

@@ -119,6 +119,14 @@ class GripperGoal:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
+class PlantWork:
+    """Work on the wood at the robot's cutter (std_msgs/String on plant_work/command)."""
+
+    what: str
+    """``"tie"``, ``"untie"`` or ``"take_leaves"``."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
 class LightsPattern:
     """Pattern of the indicator lights (std_msgs/String on indicator_lights/command)."""
 
@@ -164,6 +172,7 @@ Command = (
     | ElasticCommand
     | JointTrajectory
     | GripperGoal
+    | PlantWork
     | LightsPattern
     | LightsColor
     | LightsSound

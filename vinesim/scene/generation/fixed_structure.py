@@ -136,9 +136,11 @@ def cone_chains(
     index: np.ndarray,
     tension: float = 0.0,
     shear_modulus: float = 0.0,
+    stretch: np.ndarray | float = 0.0,
+    strength: float = 0.0,
 ) -> dict[str, np.ndarray]:
     """Returns the ``fixed_`` arrays of round cones along polylines ``points`` [chain, point, 3] m with ``radius``
-    [point] or [chain, point] m."""
+    [point] or [chain, point] m; ``stretch`` [chain * piece] N/m."""
     pieces = points.shape[1] - 1
     pairs = np.broadcast_to(np.stack([radius[..., :-1], radius[..., 1:]], -1), (len(points), pieces, 2))
     return {
@@ -148,8 +150,16 @@ def cone_chains(
         "fixed_organ": np.full(len(points) * pieces, int(organ)),
         "fixed_index": np.repeat(index, pieces),
         "fixed_tension": np.full(len(points) * pieces, tension),
+        "fixed_stretch": np.broadcast_to(stretch, len(points) * pieces),
+        "fixed_strength": np.full(len(points) * pieces, strength),
         "fixed_shear_modulus": np.full(len(points) * pieces, shear_modulus),
     }
+
+
+def wire_stretch(length: np.ndarray, diameter: float, modulus: float, anchor: float) -> np.ndarray:
+    """Returns the rise of tension [k] N/m of pieces of wire with ``length`` [k] m for each metre by which deflection
+    lengthens them: the wire and the posts at its two ends, ``anchor`` [N/m] each, in series."""
+    return 1.0 / (length / (modulus * 0.25 * np.pi * diameter**2) + 2.0 / anchor)
 
 
 def _wires(scene: Scene, parameters: VineParameters) -> list[dict[str, np.ndarray]]:
@@ -184,6 +194,17 @@ def _wires(scene: Scene, parameters: VineParameters) -> list[dict[str, np.ndarra
     for line in lines:
         number = first + np.arange(len(line))
         thickness = np.full(line.shape[1], radius)
-        pieces.append(cone_chains(line, thickness, Organ.WIRE, number, trellis.wire_tension.value))
+        length = np.linalg.norm(np.diff(line, axis=1), axis=2).ravel()
+        pieces.append(
+            cone_chains(
+                line,
+                thickness,
+                Organ.WIRE,
+                number,
+                trellis.wire_tension.value,
+                stretch=wire_stretch(length, 2.0 * radius, trellis.wire_modulus.value, trellis.wire_anchor.value),
+                strength=trellis.wire_strength.value * np.pi * radius**2,
+            )
+        )
         first += len(line)
     return pieces

@@ -125,6 +125,8 @@ class _Pieces:
             "fixed_organ": np.array([int(one) for one in organ]),
             "fixed_index": np.array(index),
             "fixed_tension": nothing,
+            "fixed_stretch": nothing,
+            "fixed_strength": nothing,
             "fixed_shear_modulus": nothing,
         }
 

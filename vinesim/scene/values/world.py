@@ -66,6 +66,8 @@ class Snapshot:
     stumps: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     """[k, 3] Stumps that cuts of canes have left: body of the stump, segment that was cut, and distance of the cut from
     the segment's origin [m]. The stump has the segment's frame."""
+    leaf_off: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, bool))
+    """[leaf] Whether each leaf has been taken off; empty: none has. The same array as long as none is taken off."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -123,23 +125,25 @@ class Detachment:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Breakage:
-    """The event that something gave without parting: wood cracked, or a tie slipped or broke."""
+    """The event that a plant changed for good without parting: wood cracked, a tie slipped or broke, or an actor worked
+    on it."""
 
     kind: str
     """``"crack"``: a cane has passed its strength and hangs on its fibres; ``"slip"``: a tie began to slip along its
-    wire; ``"untie"``: a tie broke."""
+    wire; ``"untie"``: a tie broke; ``"notch"``: a blade has left a cut that does not go through; ``"tied"``: a cane was
+    tied; ``"untied"``: a tie was opened; ``"leaves"``: leaves were taken off."""
     cause: str
-    """``"pull"``, ``"bend"`` or ``"twist"``."""
+    """``"pull"``, ``"bend"`` or ``"twist"``; for work of an actor ``"blade"`` or ``"command"``."""
     tick: int
     time: float
     """[s] Simulated time."""
     tree: int
     body: int
-    """Index of the body at whose joint the wood cracked, or which the tie held."""
+    """Index of the body at whose joint the wood cracked, which the tie held or holds, or which an actor worked on."""
     tie: int
-    """Index of the tie, -1 for wood."""
+    """Index of the tie of the model, -1 for wood and for ties that actors have made."""
     actor: str
-    """Name of the actor who presses hardest on the tree; empty if none does."""
+    """Name of the actor who worked on the tree, or presses hardest on it; empty if none does."""
     force: np.ndarray
     """[3] N, force of the tree or the tie on the body, world axes."""
     moment: np.ndarray
@@ -152,9 +156,10 @@ class Breakage:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class GivenWood:
-    """How the wood and ties of one tree have given: joints [k] with a set, and ties [j] that have slipped or broken.
+    """How one tree has changed for good, besides cuts: joints [k] with a set, ties [j] that have slipped or broken,
+    cuts that did not go through [n], ties that actors have made [b], leaves that they have taken off [m].
 
-    Places count from the tree's first body and the tree's first tie, and increase."""
+    Places count from the tree's first body, its first tie and its first leaf, and increase."""
 
     joints: np.ndarray
     """[k] int, places of the bodies."""
@@ -166,8 +171,26 @@ class GivenWood:
     """[j] int, places of the ties."""
     slid: np.ndarray
     """[j] m, float32."""
+    slid_in_all: np.ndarray
+    """[j] m, float32: see ``State.tie_flow``."""
     broken: np.ndarray
     """[j] bool"""
+    notched: np.ndarray
+    """[n] int, places of the segments."""
+    notch_at: np.ndarray
+    """[n] m, float32: see ``State.notch_at``."""
+    notch_depth: np.ndarray
+    """[n] float32: see ``State.notch_depth``."""
+    tied: np.ndarray
+    """[b] int, places of the segments to which actors have bound ties."""
+    tied_at: np.ndarray
+    """[b] int, distances of the ties from the segments' origins, in 0.1 mm."""
+    tied_to: np.ndarray
+    """[b, 3] m, float32: points in the world to which the ties pull."""
+    opened: np.ndarray
+    """[b] bool, whether the tie was opened again."""
+    bare: np.ndarray
+    """[m] int, places of the leaves that are off."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

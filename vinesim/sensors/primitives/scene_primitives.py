@@ -132,6 +132,10 @@ class Primitives:
         """``Snapshot.stumps`` as drawn."""
         self._whole: dict[int, dict[str, np.ndarray]] = {}
         """Columns of the primitives that cuts of canes have changed, before the cuts, by primitive."""
+        self._leaf_off = np.zeros(0, bool)
+        """``Snapshot.leaf_off`` as drawn."""
+        self._leaves_before: dict[int, np.ndarray] = {}
+        """Sizes [2] m of both ends of each primitive of leaves that are off, as they were drawn, by primitive."""
         self._rigid: dict[tuple[Organ, int, int], tuple[tuple[Shape, ...], ClusterLayout | None]] = {}
         """Shapes and clusters of each rigid body, by organ, index and identity of the tuple of shapes."""
         self._moved = np.zeros(0, np.int64)
@@ -404,6 +408,41 @@ class Primitives:
         self._know([*self._whole])
         return trees
 
+    def _draw_leaves(self, off: np.ndarray) -> np.ndarray:
+        """Draw leaves that are ``off`` [leaf] bool no longer, with their petioles and the small leaves in their axils;
+        empty: all are on. Returns the trees [k] that have changed."""
+        model = self.model
+        none = np.zeros(len(model.leaf_body), bool)
+        changed = (off if len(off) else none) != (self._leaf_off if len(self._leaf_off) else none)
+        self._leaf_off = off
+        leaves = np.flatnonzero(off)
+        if len(leaves) == 0 and not self._leaves_before:
+            return np.zeros(0, np.int64)
+        names = ("carrier", "organ", "kind", "local_a", "local_b")
+        carrier, organ, kind, first, last = (self._columns[name].numpy()[: self.plant_count] for name in names)
+        for row, sizes in self._leaves_before.items():
+            first[row, 3], last[row, 3] = sizes
+        segment = np.arange(self._static_carrier + 1)
+        segment[self._cuts[:, 0].astype(int)] = self._cuts[:, 1].astype(int)
+        gone = {(int(model.leaf_body[k]), model.leaf_base[k].tobytes()) for k in leaves.tolist()}
+        rows = np.flatnonzero((organ == int(Organ.LEAF)) & np.isin(segment[carrier], model.leaf_body[leaves]))
+        here = segment[carrier[rows]].tolist()
+        begins = [first[row, :3].tobytes() for row in rows.tolist()]
+        is_petiole = (kind[rows] == CONE).tolist()
+        petioles = [k for k, key in enumerate(zip(here, begins, strict=True)) if is_petiole[k] and key in gone]
+        blades = {(here[k], last[rows[k], :3].tobytes()) for k in petioles}
+        hidden = petioles + [k for k, key in enumerate(zip(here, begins, strict=True)) if key in blades]
+        self._leaves_before = {}
+        for row in rows[sorted(set(hidden))].tolist():
+            self._leaves_before[row] = np.array([first[row, 3], last[row, 3]])
+            first[row, 3] = _NOTHING
+            if kind[row] == CONE:
+                last[row, 3] = _NOTHING
+        for name, values in (("local_a", first), ("local_b", last)):
+            self._columns[name][: self.plant_count].assign(values)
+        self._know([*self._leaves_before])
+        return np.unique(model.body_tree[model.leaf_body[changed]])
+
     def _growth_places(self, rows: np.ndarray, columns: dict[str, np.ndarray]) -> np.ndarray:
         """Returns where the primitives ``rows`` [k] of plants grow along the bodies that carry them [k] m; NaN for the
         wood of the bodies themselves. ``columns``: columns of these primitives."""
@@ -569,6 +608,9 @@ class Primitives:
             trees = np.union1d(trees, self._stump_trees)
         if not np.array_equal(snapshot.stumps, self._cuts):
             trees = np.union1d(trees, self._draw_cut_canes(np.asarray(snapshot.stumps, float)))
+            self._draw_leaves(self._leaf_off)
+        if snapshot.leaf_off is not self._leaf_off and not np.array_equal(snapshot.leaf_off, self._leaf_off):
+            trees = np.union1d(trees, self._draw_leaves(snapshot.leaf_off))
         attached = np.asarray(snapshot.bunch_attached, bool)
         changed = np.flatnonzero(attached != self._attached)
         if len(changed):

@@ -1,11 +1,12 @@
-"""Contacts of many trees that touch static geoms and not each other: each tree is an island of its own.
+"""Contacts of a batch of worlds: the trees of a world touch its robots, its boxes and the static geoms, but not each
+other. The contacts of a world form one island.
 
-A GPU uses one thread for each tree, or one for each contact. The arrays of contacts interleave the trees: entry ``i``
-of a tree is at ``i * trees + tree``, so that threads in step read contiguous memory. A *view* of an array has an offset
-and a pitch, such that it contains exactly the entries of one tree. With views, narrowphase and rows use the same
-functions as in a vineyard. Most of the time is spent on reading memory. One kernel finds contacts and one solves them.
-Between these two, each body's record is read once outward for the tree, and once inward for each contact beyond the
-body.
+A GPU uses one thread for each tree, for each world, or for each contact. The arrays of contacts interleave the worlds:
+entry ``i`` of a world is at ``i * worlds + world``, so that threads in step read contiguous memory. A *view* of an
+array has an offset and a pitch, such that it contains exactly the entries of one world. With views, narrowphase and
+rows use the same functions as in a vineyard. Most of the time is spent on reading memory. One kernel finds contacts and
+one solves them. Between these two, each body's record is read once outward for the tree, and once inward for each
+contact beyond the body.
 """
 
 import warp as wp
@@ -14,7 +15,6 @@ from vinesim.kernels.contact.body_motion import to_double, to_single
 from vinesim.kernels.contact.forces import store_contact
 from vinesim.kernels.contact.friction_law import Surface
 from vinesim.kernels.contact.jacobians import write_rows
-from vinesim.kernels.contact.row_solver import solve_few_rows, solve_many_rows
 from vinesim.kernels.contact.structs import (
     Candidates,
     Capsules,
@@ -25,28 +25,6 @@ from vinesim.kernels.contact.structs import (
     RigidBodies,
     Rows,
     WarmStart,
-)
-from vinesim.kernels.contact.tree_narrowphase import TreeContacts
-from vinesim.kernels.contact.tree_solver import (
-    FIRST_SWEEPS,
-    MOST_NEWTON_CONTACTS,
-    TreeSearch,
-    TreeSystem,
-    copy_rows,
-    solve_tree,
-    synchronize_lanes,
-    update_velocities,
-)
-from vinesim.kernels.contact.tree_views import (
-    part_of_search,
-    part_of_system,
-    tree_and_entry,
-    view_contacts,
-    view_int,
-    view_rows,
-    view_search,
-    view_system,
-    view_warm_start,
 )
 from vinesim.kernels.plants.prediction import predict_tree
 from vinesim.kernels.plants.structs import (
@@ -59,6 +37,30 @@ from vinesim.kernels.plants.structs import (
     Scratch,
     SolverParameters,
     WrenchScratch,
+)
+from vinesim.kernels.worlds.dense_solver import (
+    FIRST_SWEEPS,
+    MOST_NEWTON_CONTACTS,
+    WorldSearch,
+    WorldSystem,
+    copy_rows,
+    solve_world,
+    synchronize_lanes,
+    update_velocities,
+)
+from vinesim.kernels.worlds.narrowphase import WorldContacts
+from vinesim.kernels.worlds.row_solver import solve_few_rows, solve_many_rows
+from vinesim.kernels.worlds.views import (
+    part_of_rigid,
+    part_of_search,
+    part_of_system,
+    view_contacts,
+    view_int_from,
+    view_rows,
+    view_search,
+    view_system,
+    view_warm_start,
+    world_and_entry,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -95,33 +97,42 @@ def predict_impacted_trees(
 
 
 @wp.kernel
-def write_tree_rows(
+def write_world_rows(
     # model
     parameters: Parameters,
     pairs: wp.array2d(dtype=Surface),
     capsules: Capsules,
     geoms: Geoms,
     # in
-    trees: int,
+    worlds: int,
     slots: int,
+    rigid_bodies: int,
+    dofs: int,
     bodies: PlantBodies,
     rigid: RigidBodies,
     candidates: Candidates,
     warm_start: WarmStart,
-    tree_contacts: TreeContacts,
+    world_contacts: WorldContacts,
     # out
     contacts_out: Contacts,
     rows_out: Rows,
 ):
-    """One thread per contact slot of a tree. Write the three rows of the contact in this slot."""
-    tree, c = tree_and_entry(wp.tid(), slots)
-    if tree < trees and c < tree_contacts.count[wp.min(tree, trees - 1)]:
-        contacts = view_contacts(contacts_out, tree, trees)
+    """One thread per contact slot of a world. Write the three rows of the contact in this slot.
+
+    rigid_bodies, dofs: numbers of MuJoCo bodies and degrees of freedom of a world.
+    """
+    world, c = world_and_entry(wp.tid(), slots)
+    if world < worlds and c < world_contacts.count[wp.min(world, worlds - 1)]:
+        contacts = view_contacts(contacts_out, world, worlds)
+        rows = view_rows(rows_out, world, worlds, dofs)
+        tree = world_contacts.tree[c * worlds + world]
         found = contacts.source[c]
         contacts.feature[c] = candidates.feature[tree, found]
         contacts.other[c] = candidates.other[tree, found]
         contacts.body[c] = capsules.body[candidates.feature[tree, found] // 2]
         contacts.other_body[c] = -1
+        for dof in range(dofs):
+            rows.rigid_jacobian[c, dof] = wp.vec3d()
         write_rows(
             c,
             tree,
@@ -131,11 +142,11 @@ def write_tree_rows(
             capsules,
             geoms,
             bodies,
-            rigid,
+            part_of_rigid(rigid, world, rigid_bodies, dofs),
             candidates,
-            view_warm_start(warm_start, tree, trees),
+            view_warm_start(warm_start, world, worlds),
             contacts,
-            view_rows(rows_out, tree, trees),
+            rows,
         )
 
 
@@ -241,8 +252,8 @@ def last_newton_sweep(count: int, max_newton_steps: int, max_newton_contacts: in
 
 
 @wp.func
-def copy_system(lane: int, lanes: int, size: int, source: TreeSystem, target_out: TreeSystem):
-    """Copy the contact system of one tree, and its present impulses."""
+def copy_system(lane: int, lanes: int, size: int, source: WorldSystem, target_out: WorldSystem):
+    """Copy the contact system of one world, and its present impulses."""
     for row in range(lane, size, lanes):
         for k in range(size):
             target_out.matrix[k, row] = source.matrix[k, row]
@@ -254,136 +265,137 @@ def copy_system(lane: int, lanes: int, size: int, source: TreeSystem, target_out
 
 
 @wp.kernel
-def begin_trees(
+def begin_worlds(
     # model
     max_sweeps: int,
     max_newton_steps: int,
     max_newton_contacts: int,
     tolerance: wp.float64,
     # in
-    trees: int,
+    worlds: int,
     width: int,
     # out
-    tree_contacts_out: TreeContacts,
-    system_out: TreeSystem,
-    search_out: TreeSearch,
+    world_contacts_out: WorldContacts,
+    system_out: WorldSystem,
+    search_out: WorldSearch,
 ):
-    """One CPU thread per tree. Take two sweeps for the tree's impulses, and list the tree as busy if it needs more
+    """One CPU thread per world. Take two sweeps for the world's impulses, and list the world as busy if it needs more
     sweeps."""
-    tree = wp.tid()
-    count = tree_contacts_out.count[tree]
+    world = wp.tid()
+    count = world_contacts_out.count[world]
     if count > 0:
-        system = view_system(system_out, tree, trees, width)
-        search = view_search(search_out, tree, trees, width + 1)
+        system = view_system(system_out, world, worlds, width)
+        search = view_search(search_out, world, worlds, width + 1)
         newton_end = last_newton_sweep(count, max_newton_steps, max_newton_contacts)
         update_velocities(0, 1, 3 * count, system)
         limit = wp.min(FIRST_SWEEPS, max_sweeps)
-        sweeps, busy = solve_tree(0, 0, 1, count, limit, newton_end, tolerance, system, search)
-        tree_contacts_out.sweeps[tree] = sweeps
+        sweeps, busy = solve_world(0, 0, 1, count, limit, newton_end, tolerance, system, search)
+        world_contacts_out.sweeps[world] = sweeps
         if busy and sweeps < max_sweeps:
-            tree_contacts_out.busy[wp.atomic_add(tree_contacts_out.busy_count, 0, 1)] = tree
+            world_contacts_out.busy[wp.atomic_add(world_contacts_out.busy_count, 0, 1)] = world
 
 
 @wp.kernel(cuda_max_registers=128)
-def solve_small_trees(
+def solve_small_worlds(
     # model
     max_sweeps: int,
     max_newton_steps: int,
     max_newton_contacts: int,
     tolerance: wp.float64,
     # in
-    trees: int,
+    worlds: int,
     width: int,
     lanes: int,
     # out
-    tree_contacts_out: TreeContacts,
-    system_out: TreeSystem,
+    world_contacts_out: WorldContacts,
+    system_out: WorldSystem,
 ):
-    """``lanes`` GPU threads per tree, in full warps. Solve for the impulses of the tree's contacts.
+    """``lanes`` GPU threads per world, in full warps. Solve for the impulses of the world's contacts.
 
-    Trees with more than 15 contact rows are skipped; see :data:`vinesim.kernels.contact.row_solver.solve_few_rows`.
+    Trees with more than 15 contact rows are skipped; see :data:`vinesim.kernels.worlds.row_solver.solve_few_rows`.
     """
-    tree = wp.tid() // lanes
+    world = wp.tid() // lanes
     lane = wp.tid() % lanes
     count = int(0)
-    if tree < trees:
-        count = tree_contacts_out.count[tree]
-    system = view_system(system_out, tree, trees, width)
+    if world < worlds:
+        count = world_contacts_out.count[world]
+    system = view_system(system_out, world, worlds, width)
     newton_end = last_newton_sweep(count, max_newton_steps, max_newton_contacts)
     sweeps = solve_few_rows(lane, count, max_sweeps, newton_end, tolerance, system)
     if lane == 0 and count > 0 and sweeps >= 0:
-        tree_contacts_out.sweeps[tree] = sweeps
+        world_contacts_out.sweeps[world] = sweeps
 
 
 @wp.kernel
-def solve_busy_trees(
+def solve_busy_worlds(
     # model
     max_sweeps: int,
     max_newton_steps: int,
     max_newton_contacts: int,
     tolerance: wp.float64,
     # in
-    trees: int,
+    worlds: int,
     width: int,
     lanes: int,
     groups: int,
     # out
-    tree_contacts_out: TreeContacts,
-    system_out: TreeSystem,
-    dense_out: TreeSystem,
-    search_out: TreeSearch,
+    world_contacts_out: WorldContacts,
+    system_out: WorldSystem,
+    dense_out: WorldSystem,
+    search_out: WorldSearch,
 ):
-    """``lanes`` threads per busy tree. Solve for the impulses of the tree's contacts. Each of ``groups`` groups of
-    threads processes one tree after the other.
+    """``lanes`` threads per busy world. Solve for the impulses of the world's contacts. Each of ``groups`` groups of
+    threads processes one world after the other.
 
-    A tree is *busy* if it needs more threads or sweeps than most trees. dense_out: scratch, the system of each group's
-    tree in contiguous memory.
+    A world is *busy* if it needs more threads or sweeps than most worlds. dense_out: scratch, the system of each group's
+    world in contiguous memory.
     """
     group = wp.tid() // lanes
     lane = wp.tid() % lanes
     dense = part_of_system(dense_out, group * width)
     search = part_of_search(search_out, group * width)
-    for i in range(group, tree_contacts_out.busy_count[0], groups):
-        tree = tree_contacts_out.busy[i]
-        count = tree_contacts_out.count[tree]
-        system = view_system(system_out, tree, trees, width)
+    for i in range(group, world_contacts_out.busy_count[0], groups):
+        world = world_contacts_out.busy[i]
+        count = world_contacts_out.count[world]
+        system = view_system(system_out, world, worlds, width)
         newton_end = last_newton_sweep(count, max_newton_steps, max_newton_contacts)
         sweeps = int(-1)
         if lanes > 1:
             sweeps = solve_many_rows(lane, count, max_sweeps, newton_end, tolerance, system)
         if sweeps < 0:
-            sweeps = tree_contacts_out.sweeps[tree]
+            sweeps = world_contacts_out.sweeps[world]
             copy_system(lane, lanes, 3 * count, system, dense)
             if sweeps == 0:
                 update_velocities(lane, lanes, 3 * count, dense)
             copy_rows(lane, lanes, 3 * count, dense.impulse, search.before)
             copy_rows(lane, lanes, 3 * count, dense.impulse, search.first)
-            sweeps, _busy = solve_tree(sweeps, lane, lanes, count, max_sweeps, newton_end, tolerance, dense, search)
+            sweeps, _busy = solve_world(sweeps, lane, lanes, count, max_sweeps, newton_end, tolerance, dense, search)
             copy_rows(lane, lanes, 3 * count, dense.impulse, system.impulse)
             copy_rows(lane, lanes, 3 * count, dense.velocity, system.velocity)
         if lane == 0:
-            tree_contacts_out.sweeps[tree] = sweeps
+            world_contacts_out.sweeps[world] = sweeps
         synchronize_lanes(lanes)
 
 
 @wp.kernel
-def apply_tree_impulses(
+def apply_impulses_to_trees(
     # model
     parameters: Parameters,
     model: ArticulationModel,
     is_branching: wp.array(dtype=wp.bool),
     onset_steps: int,
     # in
-    trees: int,
+    worlds: int,
     width: int,
+    dofs: int,
     body_q: wp.array(dtype=wp.transform),
     rows_all: Rows,
-    system_all: TreeSystem,
+    system_all: WorldSystem,
     factors: Factors,
     # out
     was_in_contact_out: wp.array(dtype=wp.bool),
     tree_euler_steps_out: wp.array(dtype=wp.int32),
-    tree_contacts_out: TreeContacts,
+    world_contacts_out: WorldContacts,
     contacts_out: Contacts,
     warm_start_out: WarmStart,
     body_wrench_out: wp.array(dtype=wp.spatial_vector),
@@ -398,41 +410,88 @@ def apply_tree_impulses(
     begins takes ``onset_steps`` backward Euler steps, including this step.
     """
     tree = wp.tid()
-    loaded = view_int(tree_contacts_out.loaded, tree, trees)
-    for i in range(tree_contacts_out.loaded_count[tree]):
-        body_wrench_out[loaded[i]] = wp.spatial_vector()
-    count = tree_contacts_out.count[tree]
-    tree_contacts_out.loaded_count[tree] = count
-    warm_start_out.count[tree] = count
+    world = tree % worlds
+    before = view_int_from(world_contacts_out.loaded, world_contacts_out.loaded_first[tree], world, worlds)
+    for i in range(world_contacts_out.loaded_count[tree]):
+        body_wrench_out[before[i]] = wp.spatial_vector()
+    first = world_contacts_out.first[tree]
+    count = world_contacts_out.of_tree[tree]
     was_in_contact = was_in_contact_out[tree]
     was_in_contact_out[tree] = count > 0
-    if count == 0:
-        return
-    if not was_in_contact:
-        tree_euler_steps_out[tree] = wp.max(tree_euler_steps_out[tree], onset_steps + 1)
-    contacts = view_contacts(contacts_out, tree, trees)
-    rows = view_rows(rows_all, tree, trees)
-    system = view_system(system_all, tree, trees, width)
-    warm_start = view_warm_start(warm_start_out, tree, trees)
+    if count > 0:
+        if not was_in_contact:
+            tree_euler_steps_out[tree] = wp.max(tree_euler_steps_out[tree], onset_steps + 1)
+        contacts = view_contacts(contacts_out, world, worlds)
+        rows = view_rows(rows_all, world, worlds, dofs)
+        system = view_system(system_all, world, worlds, width)
+        warm_start = view_warm_start(warm_start_out, world, worlds)
+        for c in range(first, first + count):
+            slip_u = system.velocity[3 * c + 1] - rows.bias[3 * c + 1]
+            slip_v = system.velocity[3 * c + 2] - rows.bias[3 * c + 2]
+            body = contacts.body[c]
+            store_contact(c, slip_u, slip_v, parameters, rows.impulse, contacts, warm_start)
+            body_wrench_out[body] = body_wrench_out[body] + wrench_at(
+                body_q[body], contacts.point[c], contacts.force[c]
+            )
+        apply_loaded_wrenches(
+            tree,
+            count,
+            wp.float32(parameters.dt),
+            model,
+            is_branching,
+            view_int_from(contacts_out.body, first, world, worlds),
+            body_wrench_out,
+            factors,
+            work_out,
+            scratch_out,
+            prediction_out,
+        )
+
+
+@wp.kernel
+def end_worlds(
+    # in
+    worlds: int,
+    trees: int,
+    contacts: Contacts,
+    # out
+    world_contacts_out: WorldContacts,
+    warm_start_out: WarmStart,
+):
+    """One thread per world. Note which bodies the contacts load, so that the next step can clear their wrenches."""
+    world = wp.tid()
+    count = world_contacts_out.count[world]
+    warm_start_out.count[world] = count
     for c in range(count):
-        slip_u = system.velocity[3 * c + 1] - rows.bias[3 * c + 1]
-        slip_v = system.velocity[3 * c + 2] - rows.bias[3 * c + 2]
-        body = contacts.body[c]
-        point = contacts.point[c]
-        pose = body_q[body]
-        store_contact(c, slip_u, slip_v, parameters, rows.impulse, contacts, warm_start)
-        loaded[c] = body
-        body_wrench_out[body] = body_wrench_out[body] + wrench_at(pose, point, contacts.force[c])
-    apply_loaded_wrenches(
-        tree,
-        count,
-        wp.float32(parameters.dt),
-        model,
-        is_branching,
-        loaded,
-        body_wrench_out,
-        factors,
-        work_out,
-        scratch_out,
-        prediction_out,
-    )
+        world_contacts_out.loaded[c * worlds + world] = contacts.body[c * worlds + world]
+    for tree in range(world, trees, worlds):
+        world_contacts_out.loaded_first[tree] = world_contacts_out.first[tree]
+        world_contacts_out.loaded_count[tree] = world_contacts_out.of_tree[tree]
+
+
+@wp.kernel
+def add_contact_efforts(
+    # model
+    parameters: Parameters,
+    # in
+    worlds: int,
+    dofs: int,
+    rows_all: Rows,
+    world_contacts: WorldContacts,
+    # out
+    effort_out: wp.array2d(dtype=float),
+):
+    """One thread per degree of freedom of a world's rigid bodies. Write the generalised force of the contacts with
+    plants.
+
+    effort: [world, dof] N or N m.
+    """
+    world = wp.tid() % worlds
+    dof = wp.tid() / worlds
+    rows = view_rows(rows_all, world, worlds, dofs)
+    effort = wp.float64(0.0)
+    for c in range(world_contacts.count[world]):
+        entry = rows.rigid_jacobian[c, dof]
+        for r in range(3):
+            effort = effort - entry[r] * rows.impulse[3 * c + r]
+    effort_out[world, dof] = wp.float32(effort / parameters.dt)

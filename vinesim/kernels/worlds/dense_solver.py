@@ -1,9 +1,9 @@
-"""Solves the contacts of one tree with static geoms as a dense system, by the algorithm of the island solver.
+"""Solves the contacts of one world with static geoms as a dense system, by the algorithm of the island solver.
 
 :mod:`vinesim.kernels.contact.projected_gauss_seidel` solves islands of many blocks that rigid bodies couple, with lists
-of blocks. The contacts of a single tree form one matrix and no rigid body moves, so the velocity along a row is one
-sum. On a GPU, :mod:`vinesim.kernels.contact.row_solver` does the same with one thread for each row. This module solves
-trees with too many contacts for ``row_solver``, with one warp for each tree. The threads of a warp share the rows and
+of blocks. The contacts of a single world form one matrix and no rigid body moves, so the velocity along a row is one
+sum. On a GPU, :mod:`vinesim.kernels.worlds.row_solver` does the same with one thread for each row. This module solves
+worlds with too many contacts for ``row_solver``, with one warp for each world. The threads of a warp share the rows and
 take the same decisions from the same numbers. On a CPU one thread has all rows. The matrix is in single precision, like
 the impulse response from which it is computed. All other numbers are in double precision.
 """
@@ -31,15 +31,15 @@ LANES_ACROSS = wp.constant(16)
 """Number of threads that share the columns of a row in the solution of a linear system. A warp processes two rows at
 once."""
 FIRST_SWEEPS = wp.constant(2)
-"""Number of sweeps after which a tree that has not converged is listed as busy. The search can return to the impulses
+"""Number of sweeps after which a world that has not converged is listed as busy. The search can return to the impulses
 at this point."""
 MOST_NEWTON_CONTACTS = wp.constant(16)
-"""Largest number of contacts whose indices fit into one word. Trees with more contacts take no Newton steps."""
+"""Largest number of contacts whose indices fit into one word. Worlds with more contacts take no Newton steps."""
 
 
 @wp.struct
-class TreeSystem:
-    """The linear system and the contact properties that determine the impulses of one tree's contacts."""
+class WorldSystem:
+    """The linear system and the contact properties that determine the impulses of one world's contacts."""
 
     matrix: wp.array2d(dtype=float)
     """[row, row] Delassus matrix, 1/kg."""
@@ -54,8 +54,8 @@ class TreeSystem:
 
 
 @wp.struct
-class TreeSearch:
-    """Scratch of the search for the impulses of one tree after its first sweeps."""
+class WorldSearch:
+    """Scratch of the search for the impulses of one world after its first sweeps."""
 
     factor: wp.array2d(dtype=wp.float64)
     """[row, row + 1] Linear system of a Newton step; the last column is the right-hand side."""
@@ -76,7 +76,7 @@ if (lanes > 1) {
 #endif
 """)
 def synchronize_lanes(lanes: int):
-    """Wait until all threads that share the tree have called this function. Writes before the call are then visible to
+    """Wait until all threads that share the world have called this function. Writes before the call are then visible to
     all of them.
 
     The threads are adjacent in one warp; ``lanes`` divides 32.
@@ -85,8 +85,8 @@ def synchronize_lanes(lanes: int):
 
 
 @wp.func
-def update_velocities(lane: int, lanes: int, size: int, system_out: TreeSystem):
-    """Compute the velocities along all contact rows of a tree from the impulses."""
+def update_velocities(lane: int, lanes: int, size: int, system_out: WorldSystem):
+    """Compute the velocities along all contact rows of a world from the impulses."""
     for row in range(lane, size, lanes):
         value = system_out.free[row]
         for j in range(size):  # the matrix is symmetric: along its row, threads in step read one stretch
@@ -96,7 +96,7 @@ def update_velocities(lane: int, lanes: int, size: int, system_out: TreeSystem):
 
 
 @wp.func
-def steps_of_contact(c: int, system: TreeSystem):
+def steps_of_contact(c: int, system: WorldSystem):
     """Returns the step sizes of a contact's Gauss-Seidel step."""
     own = wp.mat33d()
     for r in range(3):
@@ -107,7 +107,7 @@ def steps_of_contact(c: int, system: TreeSystem):
 
 
 @wp.func
-def relax_contact(c: int, lane: int, lanes: int, size: int, system_out: TreeSystem):
+def relax_contact(c: int, lane: int, lanes: int, size: int, system_out: WorldSystem):
     """Take one Gauss-Seidel step of a contact.
 
     Returns its normal impulse and the size of the change of impulse [N s].
@@ -135,7 +135,7 @@ def relax_contact(c: int, lane: int, lanes: int, size: int, system_out: TreeSyst
 
 
 @wp.func
-def list_pressing(count: int, system: TreeSystem):
+def list_pressing(count: int, system: WorldSystem):
     """Returns the indices of the closed contacts, four bits each, and their number."""
     listed = wp.int64(0)
     found = int(0)
@@ -175,7 +175,7 @@ def sliding_row(part: int, x: wp.vec3d, velocity: wp.vec3d, steps: Steps, surfac
 
 
 @wp.func
-def write_sliding_row(i: int, listed: wp.int64, size: int, system: TreeSystem, search_out: TreeSearch):
+def write_sliding_row(i: int, listed: wp.int64, size: int, system: WorldSystem, search_out: WorldSearch):
     """Write a friction row of a sliding contact; see :func:`sliding_row`."""
     n = row_of(listed, i - i % 3)
     c = n // 3
@@ -194,7 +194,9 @@ def write_sliding_row(i: int, listed: wp.int64, size: int, system: TreeSystem, s
 
 
 @wp.func
-def write_newton_system(listed: wp.int64, lane: int, lanes: int, size: int, system: TreeSystem, search_out: TreeSearch):
+def write_newton_system(
+    listed: wp.int64, lane: int, lanes: int, size: int, system: WorldSystem, search_out: WorldSearch
+):
     """Write the linear system for the present states of the listed contacts, which are the closed ones. Open contacts
     have no impulse.
 
@@ -215,7 +217,7 @@ def write_newton_system(listed: wp.int64, lane: int, lanes: int, size: int, syst
 
 @wp.func
 def solve_newton_system(
-    listed: wp.int64, lane: int, lanes: int, size: int, system_out: TreeSystem, search_out: TreeSearch
+    listed: wp.int64, lane: int, lanes: int, size: int, system_out: WorldSystem, search_out: WorldSearch
 ):
     """Solve the linear system by Gaussian elimination without pivoting: the matrix is positive definite, and sliding
     rows change it little."""
@@ -240,7 +242,7 @@ def solve_newton_system(
 
 
 @wp.func
-def take_newton_step(lane: int, lanes: int, count: int, system_out: TreeSystem, search_out: TreeSearch):
+def take_newton_step(lane: int, lanes: int, count: int, system_out: WorldSystem, search_out: WorldSearch):
     """Solve for the impulses with each contact in its present state (open, sticking or sliding), and project them into
     their friction cones."""
     listed, found = list_pressing(count, system_out)
@@ -252,7 +254,7 @@ def take_newton_step(lane: int, lanes: int, count: int, system_out: TreeSystem, 
 
 
 @wp.func
-def project_into_cones(lane: int, lanes: int, count: int, system_out: TreeSystem):
+def project_into_cones(lane: int, lanes: int, count: int, system_out: WorldSystem):
     """Project the impulses into their friction cones, where the assumed state of a contact was wrong."""
     for c in range(lane, count, lanes):
         x = project_into_cone(three(3 * c, system_out.impulse), system_out.surface[c])
@@ -262,9 +264,9 @@ def project_into_cones(lane: int, lanes: int, count: int, system_out: TreeSystem
 
 @wp.func
 def follow_conjugate_direction(
-    gradient_before: wp.float64, lane: int, lanes: int, size: int, system_out: TreeSystem, search_out: TreeSearch
+    gradient_before: wp.float64, lane: int, lanes: int, size: int, system_out: WorldSystem, search_out: WorldSearch
 ):
-    """Move the impulses of a tree along the conjugate direction after a Gauss-Seidel sweep. Returns the square of the
+    """Move the impulses of a world along the conjugate direction after a Gauss-Seidel sweep. Returns the square of the
     gradient, which is the change of the impulses by the sweep [N^2 s^2].
 
     See :func:`vinesim.kernels.contact.conjugate_gradient.follow_conjugate_direction`.
@@ -295,7 +297,7 @@ def follow_conjugate_direction(
 def copy_rows(
     lane: int, lanes: int, size: int, source: wp.array(dtype=wp.float64), target_out: wp.array(dtype=wp.float64)
 ):
-    """Copy the values of all contact rows of one tree."""
+    """Copy the values of all contact rows of one world."""
     for row in range(lane, size, lanes):
         target_out[row] = source[row]
     synchronize_lanes(lanes)
@@ -309,8 +311,8 @@ def step_or_follow(
     lane: int,
     lanes: int,
     count: int,
-    system_out: TreeSystem,
-    search_out: TreeSearch,
+    system_out: WorldSystem,
+    search_out: WorldSearch,
 ):
     """Continue the search between two sweeps, by a Newton step or along a conjugate direction. Returns the square of
     the gradient [N^2 s^2]."""
@@ -326,8 +328,8 @@ def step_or_follow(
 
 
 @wp.func
-def sweep_contacts(lane: int, lanes: int, count: int, tolerance: wp.float64, system_out: TreeSystem):
-    """Take one Gauss-Seidel step of each contact of a tree.
+def sweep_contacts(lane: int, lanes: int, count: int, tolerance: wp.float64, system_out: WorldSystem):
+    """Take one Gauss-Seidel step of each contact of a world.
 
     Returns whether an impulse changed by more than ``tolerance`` times the largest impulse.
     """
@@ -341,7 +343,7 @@ def sweep_contacts(lane: int, lanes: int, count: int, tolerance: wp.float64, sys
 
 
 @wp.func
-def solve_tree(
+def solve_world(
     sweeps: int,
     lane: int,
     lanes: int,
@@ -349,17 +351,17 @@ def solve_tree(
     max_sweeps: int,
     newton_end: int,
     tolerance: wp.float64,
-    system_out: TreeSystem,
-    search_out: TreeSearch,
+    system_out: WorldSystem,
+    search_out: WorldSearch,
 ):
-    """Solve for the impulses of ``count`` contacts of a tree. ``sweeps``: number of sweeps that were taken before the
+    """Solve for the impulses of ``count`` contacts of a world. ``sweeps``: number of sweeps that were taken before the
     call.
 
     Returns the total number of sweeps, and whether the last sweep changed more than ``tolerance``.
 
     The method is that of :func:`vinesim.kernels.contact.projected_gauss_seidel.solve_island`, but with a Newton step
     after every sweep up to ``newton_end``, in which the direction of sliding is linearised. ``lane``: index of this
-    thread among the ``lanes`` threads that share the tree.
+    thread among the ``lanes`` threads that share the world.
     """
     gradient = wp.float64(0.0)
     busy = bool(True)

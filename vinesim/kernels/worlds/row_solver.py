@@ -1,7 +1,7 @@
-"""The solver of :mod:`vinesim.kernels.contact.tree_solver` on a GPU, with one thread for each row.
+"""The solver of :mod:`vinesim.kernels.worlds.dense_solver` on a GPU, with one thread for each row.
 
-The matrices of trees are small, and their solve is a chain of dependent steps. Each step takes many times longer
-through memory, even shared memory, than through registers and shuffles. The algorithm is that of ``tree_solver``. A
+The matrices of worlds are small, and their solve is a chain of dependent steps. Each step takes many times longer
+through memory, even shared memory, than through registers and shuffles. The algorithm is that of ``dense_solver``. A
 Newton step replaces the rows of contacts that are not closed by rows of an identity matrix.
 
 The native code exchanges numbers between the threads of a warp and solves linear systems in registers. It does not
@@ -26,7 +26,7 @@ from vinesim.kernels.contact.friction_law import (
     size_of_change,
     slides,
 )
-from vinesim.kernels.contact.tree_solver import FIRST_SWEEPS, TreeSystem, sliding_row, steps_of_contact
+from vinesim.kernels.worlds.dense_solver import FIRST_SWEEPS, WorldSystem, sliding_row, steps_of_contact
 
 wp.set_module_options({"enable_backward": False})
 
@@ -38,7 +38,7 @@ def _on_gpu(code: str, elsewhere: str = "0") -> str:
 
 @wp.func_native(_on_gpu("return __shfl_sync(ALL, value, source, lanes);"))
 def from_lane(value: wp.float64, source: int, lanes: int) -> wp.float64:
-    """Returns the number that thread ``source`` holds in ``value``. The ``lanes`` threads that solve one tree have the
+    """Returns the number that thread ``source`` holds in ``value``. The ``lanes`` threads that solve one world have the
     indices 0 to ``lanes`` - 1.
     """
     ...
@@ -48,7 +48,7 @@ def from_lane(value: wp.float64, source: int, lanes: int) -> wp.float64:
     _on_gpu("return __ballot_sync(ALL, value) >> (threadIdx.x % 32 - lane) & (0xffffffffu >> (32 - lanes));")
 )
 def lanes_where(value: bool, lane: int, lanes: int) -> wp.uint32:
-    """Returns a bit for each thread of the tree: whether its value is true."""
+    """Returns a bit for each thread of the world: whether its value is true."""
     ...
 
 
@@ -80,7 +80,7 @@ return value;
 """)
 )
 def sum_of_lanes(value: wp.float64, lanes: int) -> wp.float64:
-    """Returns the sum of the values of the tree's threads."""
+    """Returns the sum of the values of the world's threads."""
     ...
 
 
@@ -91,7 +91,7 @@ return value;
 """)
 )
 def largest_of_lanes(value: wp.float64, lanes: int) -> wp.float64:
-    """Returns the largest value of the tree's threads."""
+    """Returns the largest value of the world's threads."""
     ...
 
 
@@ -121,10 +121,10 @@ def follow_direction(
     lanes: int,
 ):
     """Add a step along the conjugate direction to a thread's impulse, after a sweep that changed the impulse by
-    ``change``. Only trees that follow the direction (``follows``) take the step.
+    ``change``. Only worlds that follow the direction (``follows``) take the step.
 
-    Returns the impulse, the direction, and the square of the change of all impulses of the tree. See
-    :func:`vinesim.kernels.contact.tree_solver.follow_conjugate_direction`.
+    Returns the impulse, the direction, and the square of the change of all impulses of the world. See
+    :func:`vinesim.kernels.worlds.dense_solver.follow_conjugate_direction`.
     """
     if not any_of_warp(follows):
         return x, direction, gradient_before
@@ -165,7 +165,7 @@ return right * by_pivot;
 
 
 def row_solver(rows: int, lanes: int) -> Any:  # noqa: PLR0915 (it holds eight functions)
-    """Returns a Warp function that solves a tree of at most ``rows`` rows with ``lanes`` threads of a GPU, 16 or 32."""
+    """Returns a Warp function that solves a world of at most ``rows`` rows with ``lanes`` threads of a GPU, 16 or 32."""
     Column = wp.types.vector(length=rows, dtype=wp.float32)
 
     def func(function: Callable[..., Any]) -> Any:
@@ -197,7 +197,7 @@ def row_solver(rows: int, lanes: int) -> Any:  # noqa: PLR0915 (it holds eight f
     @func
     def moved_velocity(moves: bool, x: wp.float64, v: wp.float64, outside: wp.float64, column: Column):
         """Returns the velocity [m/s] along a thread's row: the present velocity ``v`` if no impulse of the thread's
-        tree has changed (``moves`` false), else the result of ``row_velocity``.
+        world has changed (``moves`` false), else the result of ``row_velocity``.
         """
         if not any_of_warp(moves):
             return v
@@ -221,7 +221,7 @@ def row_solver(rows: int, lanes: int) -> Any:  # noqa: PLR0915 (it holds eight f
         The thread's row of the system is ``own`` times its column of the symmetric matrix plus ``others`` times its
         partner's column, in the given columns, plus ``added`` in the columns of its own contact. ``right`` is its
         right-hand side. Gauss-Jordan elimination without pivoting: see
-        :func:`vinesim.kernels.contact.tree_solver.solve_newton_system`.
+        :func:`vinesim.kernels.worlds.dense_solver.solve_newton_system`.
         """
         ...
 
@@ -238,7 +238,7 @@ def row_solver(rows: int, lanes: int) -> Any:  # noqa: PLR0915 (it holds eight f
         surface: Surface,
         column: Column,
     ):
-        """Returns the impulse along a thread's row. If the thread's tree ``takes_step``, the impulse comes from a Newton
+        """Returns the impulse along a thread's row. If the thread's world ``takes_step``, the impulse comes from a Newton
         step with all contacts in their present states, projected into the contact's friction cone; otherwise it is
         ``x``.
         """
@@ -280,7 +280,7 @@ def row_solver(rows: int, lanes: int) -> Any:  # noqa: PLR0915 (it holds eight f
         s].
 
         Each thread computes for its own contact, and uses the result at that contact's turn. turns: number of contacts
-        of the thread's tree; 0 if its impulses do not change any more.
+        of the thread's world; 0 if its impulses do not change any more.
         """
         c = lane // 3
         part = lane % 3
@@ -307,9 +307,9 @@ def row_solver(rows: int, lanes: int) -> Any:  # noqa: PLR0915 (it holds eight f
         max_sweeps: int,
         newton_end: int,
         tolerance: wp.float64,
-        system_out: TreeSystem,
+        system_out: WorldSystem,
     ):
-        """Solve for the impulses of ``count`` contacts of a tree; this thread has the index ``lane``.
+        """Solve for the impulses of ``count`` contacts of a world; this thread has the index ``lane``.
 
         Returns the number of sweeps, or -1 if there are too many rows; nothing is changed then.
 
@@ -318,7 +318,7 @@ def row_solver(rows: int, lanes: int) -> Any:  # noqa: PLR0915 (it holds eight f
         functions.
         """
         size = wp.where(3 * count <= rows, 3 * count, 0)
-        most = most_of_warp(size)  # all trees of a warp go through the same steps
+        most = most_of_warp(size)  # all worlds of a warp go through the same steps
         if most == 0:
             return wp.where(count > 0, -1, 0)
         is_row = lane < size
@@ -358,7 +358,7 @@ def row_solver(rows: int, lanes: int) -> Any:  # noqa: PLR0915 (it holds eight f
             done = wp.where(busy, sweeps, done)
             changing = lanes_where(
                 change > tolerance * largest, lane, lanes
-            )  # all threads call this, also of finished trees
+            )  # all threads call this, also of finished worlds
             busy = busy and changing != wp.uint32(0)
         if is_row:
             system_out.impulse[lane] = x
@@ -369,6 +369,6 @@ def row_solver(rows: int, lanes: int) -> Any:  # noqa: PLR0915 (it holds eight f
 
 
 solve_few_rows = row_solver(15, 16)
-"""Solves a tree of at most 15 rows with 16 threads."""
+"""Solves a world of at most 15 rows with 16 threads."""
 solve_many_rows = row_solver(30, 32)
-"""Solves a tree of at most 30 rows with the 32 threads of a warp."""
+"""Solves a world of at most 30 rows with the 32 threads of a warp."""

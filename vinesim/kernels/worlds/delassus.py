@@ -1,19 +1,20 @@
-"""The Delassus matrices of trees that touch static geoms: velocity changes at a tree's contacts by its contact
-impulses.
+"""The Delassus matrices of the worlds of a batch: velocity changes at a world's contacts by its contact impulses.
 
-They are computed from the factored joints, in one pass outward for the tree and one inward for each contact: see
-:func:`respond_at_contacts` and :func:`write_delassus`.
+Impulses move trees and rigid bodies. The response of a tree is computed from its factored joints, in one pass outward
+for the tree and one inward for each contact: see :func:`respond_at_contacts` and :func:`write_delassus`. The response of
+the rigid bodies is the inverse of their effective mass: see :func:`invert_effective_mass`.
 """
 
 import warp as wp
 
+from vinesim.kernels.contact.body_motion import to_single
 from vinesim.kernels.contact.jacobians import row_columns
-from vinesim.kernels.contact.structs import Contacts, Rows
-from vinesim.kernels.contact.tree_narrowphase import TreeContacts
-from vinesim.kernels.contact.tree_solver import TreeSystem
-from vinesim.kernels.contact.tree_views import tree_and_entry, view_contacts, view_rows, view_system
+from vinesim.kernels.contact.structs import Contacts, Geoms, Rows
 from vinesim.kernels.plants.spatial import cross_rows, symmetric
 from vinesim.kernels.plants.structs import ArticulationModel, Factors
+from vinesim.kernels.worlds.dense_solver import WorldSystem
+from vinesim.kernels.worlds.narrowphase import WorldContacts
+from vinesim.kernels.worlds.views import view_contacts, view_rows, view_system, view_table, world_and_entry
 
 wp.set_module_options({"enable_backward": False})
 
@@ -36,7 +37,7 @@ class BodyCompliances:
 @wp.struct
 class ResponseRows:
     """Velocity changes of a contact's body by unit impulses along the contact's three rows, one column for each row
-    [slot * trees + tree]."""
+    [slot * worlds + world]."""
 
     a: wp.array(dtype=wp.mat33)
     """[1/kg] Linear velocity changes."""
@@ -50,11 +51,12 @@ def respond_at_contacts(
     model: ArticulationModel,
     is_branching: wp.array(dtype=wp.bool),
     # in
-    trees: int,
+    worlds: int,
+    dofs: int,
     factors: Factors,
     contacts_all: Contacts,
     rows_all: Rows,
-    tree_contacts: TreeContacts,
+    world_contacts: WorldContacts,
     # out
     compliances_out: BodyCompliances,
     response_out: ResponseRows,
@@ -69,17 +71,18 @@ def respond_at_contacts(
     body other than the next one.
     """
     tree = wp.tid()
-    count = tree_contacts.count[tree]
-    if count == 0:
+    world = tree % worlds
+    at = int(world_contacts.first[tree])
+    end = at + world_contacts.of_tree[tree]
+    if at == end:
         return
-    contacts = view_contacts(contacts_all, tree, trees)
-    rows = view_rows(rows_all, tree, trees)
+    contacts = view_contacts(contacts_all, world, worlds)
+    rows = view_rows(rows_all, world, worlds, dofs)
     P = wp.mat33()
     Q = wp.mat33()
     R = wp.mat33()
-    at = int(0)
-    touched = int(contacts.body[0])
-    for k in range(model.tree_first[tree], contacts.body[count - 1] + 1, model.pitch):
+    touched = int(contacts.body[at])
+    for k in range(model.tree_first[tree], contacts.body[end - 1] + 1, model.pitch):
         # all values of a body are read before the first branch, so that a GPU waits for memory once
         parent = model.body_parent[k]
         branches = is_branching[k]
@@ -110,11 +113,11 @@ def respond_at_contacts(
         while touched == k:
             force = row_columns(at, 0, rows.plant_jacobian)
             moment = row_columns(at, 3, rows.plant_jacobian)
-            response_out.a[at * trees + tree] = P * force + Q * moment
-            response_out.alpha[at * trees + tree] = turn * force + R * moment
+            response_out.a[at * worlds + world] = P * force + Q * moment
+            response_out.alpha[at * worlds + world] = turn * force + R * moment
             at = at + 1
             touched = -1
-            if at < count:
+            if at < end:
                 touched = contacts.body[at]
 
 
@@ -169,58 +172,85 @@ def common_body_response(
     return block
 
 
+@wp.func
+def write_rigid_response(c: int, dofs: int, inverse: wp.array2d(dtype=wp.float64), rows_out: Rows):
+    """Write the velocity changes of a world's rigid bodies by unit impulses along the rows of contact ``c``.
+
+    ``inverse`` [dof, dof]: inverse of the effective mass. The signs are those of impulses on the rigid bodies.
+    """
+    for dof in range(dofs):
+        change = wp.vec3d()
+        for k in range(dofs):
+            change = change + inverse[dof, k] * rows_out.rigid_jacobian[c, k]
+        rows_out.rigid_response[c, dof] = change
+
+
 @wp.kernel
 def write_delassus(
     # model
     model: ArticulationModel,
+    geoms: Geoms,
     # in
-    trees: int,
+    worlds: int,
     width: int,
+    dofs: int,
     factors: Factors,
-    tree_contacts: TreeContacts,
+    world_contacts: WorldContacts,
     contacts_all: Contacts,
-    rows_all: Rows,
     compliances: BodyCompliances,
     response: ResponseRows,
+    rigid_inverse: wp.array2d(dtype=wp.float64),
     # out
-    system_out: TreeSystem,
+    rows_out: Rows,
+    system_out: WorldSystem,
 ):
-    """One thread per contact slot of a tree. Write the contact in this slot into the tree's system, and the entries of
-    the Delassus matrix for the contact's impulses.
+    """One thread per contact slot of a world. Write the contact in this slot into the world's system, and the entries
+    of the Delassus matrix for the contact's impulses.
 
     The entries are velocity changes along the rows of all contacts up to this one. The contact's impulses are
-    propagated inward. When they reach a body with another contact, the entry follows from the response of that contact,
-    because the matrix is symmetric.
+    propagated inward in its tree. When they reach a body with another contact, the entry follows from the response of
+    that contact, because the matrix is symmetric. Contacts of different trees act on each other through rigid bodies
+    only.
     """
-    tree, c = tree_and_entry(wp.tid(), width / 3)
-    if tree >= trees or c >= tree_contacts.count[wp.min(tree, trees - 1)]:
+    world, c = world_and_entry(wp.tid(), width / 3)
+    if world >= worlds or c >= world_contacts.count[wp.min(world, worlds - 1)]:
         return
-    contacts = view_contacts(contacts_all, tree, trees)
-    rows = view_rows(rows_all, tree, trees)
-    system = view_system(system_out, tree, trees, width)
+    contacts = view_contacts(contacts_all, world, worlds)
+    rows = view_rows(rows_out, world, worlds, dofs)
+    system = view_system(system_out, world, worlds, width)
     n = 3 * c
     velocity = wp.vec3d(rows.velocity_free[n], rows.velocity_free[n + 1], rows.velocity_free[n + 2])
     bias = wp.vec3d(rows.bias[n], rows.bias[n + 1], rows.bias[n + 2])
     force = row_columns(c, 0, rows.plant_jacobian)
     moment = row_columns(c, 3, rows.plant_jacobian)
     k = int(contacts.body[c])
+    first = world_contacts.first[world_contacts.tree[c * worlds + world]]
+    moves = contacts.other[c] < geoms.count[0]
+    if moves:
+        write_rigid_response(c, dofs, view_table(rigid_inverse, world, worlds, dofs), rows)
     for r in range(3):
         system.free[n + r] = velocity[r] + bias[r]
     for back in range(c + 1):
         other = c - back
-        body = contacts.body[other]
-        while k > body:
-            parent = model.body_parent[k]
-            force, moment = carry_to_parent(k, factors, force, moment)
-            k = parent
         block = wp.mat33()
-        if k == body:
-            slot = other * trees + tree
-            block = wp.transpose(response.a[slot]) * force + wp.transpose(response.alpha[slot]) * moment
-        elif k >= 0:
-            block = common_body_response(
-                c, other, k, body, model, factors, compliances, rows.plant_jacobian, force, moment
-            )
+        if other >= first:
+            body = contacts.body[other]
+            while k > body:
+                parent = model.body_parent[k]
+                force, moment = carry_to_parent(k, factors, force, moment)
+                k = parent
+            if k == body:
+                slot = other * worlds + world
+                block = wp.transpose(response.a[slot]) * force + wp.transpose(response.alpha[slot]) * moment
+            elif k >= 0:
+                block = common_body_response(
+                    c, other, k, body, model, factors, compliances, rows.plant_jacobian, force, moment
+                )
+        if moves and contacts.other[other] < geoms.count[0]:
+            for dof in range(dofs):
+                along = rows.rigid_jacobian[other, dof]
+                change = rows.rigid_response[c, dof]
+                block = block + wp.outer(to_single(along), to_single(change))
         if other == c:
             block = symmetric(block)
         for r in range(3):

@@ -1,0 +1,103 @@
+"""The task reach as a Gymnasium vector environment."""
+
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+
+gymnasium = pytest.importorskip("gymnasium")
+pytest.importorskip("mujoco_warp")
+pytest.importorskip("vinesim.learn")
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def environment() -> Any:
+    return gymnasium.make_vec("vinesim/Reach-v0", num_envs=3)
+
+
+def towards_bunch(env: Any, observation: np.ndarray) -> np.ndarray:
+    """Returns the action that moves the fingers along the way to the wanted bunch, by the transposed Jacobian."""
+    import mujoco
+
+    bodies = env.unwrapped.worlds.bodies
+    robot = bodies.rigid.robot("arm")
+    m = bodies.rigid.mj_model
+    d = mujoco.MjData(m)
+    actions = []
+    for world, seen in enumerate(observation):
+        d.qpos[:] = bodies.data.qpos.numpy()[world]
+        mujoco.mj_kinematics(m, d)
+        mujoco.mj_comPos(m, d)
+        body = robot.bodies["link_6"]
+        point = d.xpos[body] + d.xmat[body].reshape(3, 3) @ np.array([0.2, 0.0, 0.0])
+        jacobian = np.zeros((3, m.nv))
+        mujoco.mj_jac(m, d, jacobian, None, point, body)
+        J = jacobian[:, robot.v[:7]]
+        way = np.linalg.solve(J @ J.T + 0.01 * np.eye(3), seen[14:17])
+        actions.append(np.clip(8.0 * J.T @ way, -1.0, 1.0))
+    return np.array(actions, np.float32)
+
+
+def test_spaces_and_counts(environment):
+    observation, info = environment.reset(seed=1)
+    assert observation.shape == (3, 31)
+    assert observation.dtype == np.float32
+    assert environment.observation_space.contains(observation)
+    assert not info["success"].any()
+    wanted = observation[:, -4:]
+    np.testing.assert_array_equal(wanted.sum(1), 1.0)
+    distances = np.linalg.norm(observation[:, 14:17], axis=1)
+    assert ((distances > 0.1) & (distances < 1.0)).all()
+
+
+def test_equal_seeds_and_actions_give_equal_episodes_to_the_bit(environment):
+    def episode() -> list[np.ndarray]:
+        rng = np.random.default_rng(3)
+        seen = [environment.reset(seed=7)[0]]
+        for _ in range(10):
+            seen += environment.step(rng.uniform(-1.0, 1.0, (3, 7)).astype(np.float32))[:2]
+        return seen
+
+    for one, other in zip(episode(), episode(), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_simple_controller_reaches_the_bunches(environment):
+    """A world that succeeds begins again at once, with the observation of its last state in ``final_obs``."""
+    observation, _ = environment.reset(seed=2)
+    reached = 0
+    for _ in range(100):
+        observation, reward, terminated, truncated, info = environment.step(towards_bunch(environment, observation))
+        for world in np.flatnonzero(info["success"]):
+            reached += 1
+            assert terminated[world]
+            assert reward[world] > 5.0
+            assert np.linalg.norm(info["final_obs"][world, 14:17]) < 0.05
+            assert np.linalg.norm(observation[world, 14:17]) > 0.1
+        assert not truncated.any() or reached
+    assert reached >= 3
+
+
+def test_an_episode_without_success_is_truncated(environment):
+    environment.reset(seed=5)
+    ends = [environment.step(np.zeros((3, 7), np.float32))[2:4] for _ in range(100)]
+    assert not any(terminated.any() for terminated, _ in ends)
+    assert [bool(truncated.all()) for _, truncated in ends].index(True) == 99
+
+
+def test_gymnasium_finds_no_fault_in_one_world():
+    from gymnasium.utils.env_checker import check_env
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the checker advises against observations without bounds
+        check_env(gymnasium.make("vinesim/Reach-v0").unwrapped, skip_render_check=True)
+
+
+def test_bad_arguments_are_named():
+    with pytest.raises(ValueError, match="num_envs 0"):
+        gymnasium.make_vec("vinesim/Reach-v0", num_envs=0)
+    with pytest.raises(ValueError, match="render_mode"):
+        gymnasium.make_vec("vinesim/Reach-v0", num_envs=1, render_mode="rgb_array")

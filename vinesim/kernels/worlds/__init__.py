@@ -1,0 +1,7 @@
+"""Kernels of batches of worlds (:mod:`vinesim.worlds`): contacts of trees with robots and boxes, one system a world.
+
+``narrowphase`` finds the contacts, ``contact_step`` writes their rows and applies their impulses, ``delassus`` writes
+the system of a world, ``dense_solver`` and ``row_solver`` solve it, ``rigid_state`` exchanges numbers with mujoco_warp,
+``views`` selects the entries of one world. The contact law and the shapes are those of
+:mod:`vinesim.kernels.contact`.
+"""

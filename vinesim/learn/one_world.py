@@ -1,0 +1,36 @@
+"""A vector environment with one world as an environment, for libraries that want those."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+
+from vinesim.learn.reach import ReachEnv
+
+
+class ReachOne(gymnasium.Env[np.ndarray, np.ndarray]):
+    """:class:`ReachEnv` with one world. ``options``: arguments of :class:`ReachEnv` except ``num_envs``."""
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+
+    def __init__(self, **options: Any) -> None:
+        self.vector = ReachEnv(1, **options)
+        self.action_space = self.vector.single_action_space
+        self.observation_space = self.vector.single_observation_space
+        self.render_mode = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin an episode; see :class:`gymnasium.Env`."""
+        super().reset(seed=seed)
+        observation, _ = self.vector.reset(seed=seed, options=options)
+        return observation[0], {"success": False}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Take one action; see :class:`gymnasium.Env`."""
+        observation, reward, terminated, truncated, info = self.vector.step(np.asarray(action)[None])
+        seen = info.get("final_obs", observation)[0]
+        return seen, float(reward[0]), bool(terminated[0]), bool(truncated[0]), {"success": bool(info["success"][0])}

@@ -1,0 +1,141 @@
+"""Worlds with robots, boxes and plants, stepped together on one device.
+
+A step has the stages of :class:`vinesim.world.Physics`: both sides predict their velocities, the contacts of each world
+are found and solved together, both sides integrate. Nothing is copied between host and GPU during a step.
+
+What a client's world has and a batch does not: contacts between plants, wires and arms that deform, hands of people,
+wood that cracks, sleep, and bunches with moving berry clusters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+import warp as wp
+
+from vinesim.kernels.graph import KernelGraph, KernelLaunch
+from vinesim.kernels.worlds.reset import restore_bodies, restore_worlds
+from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.rigid.rigid_world import RigidWorld
+from vinesim.scene.model import Model
+from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.scene.state import State
+from vinesim.scene.values import RobotSpec
+from vinesim.worlds.batch_contacts import BatchContacts
+from vinesim.worlds.rigid_batch import RigidBatch
+
+DEFAULT_SLOTS = 16
+"""Default for the number of contacts that the plants of one world can have at once."""
+_BODY_STATE = ("joint_q", "joint_qd", "body_q", "body_qd", "body_qd_free", "body_wrench", "body_acceleration")
+"""Arrays with a row for each body that change in a step and that the next step reads."""
+
+
+def _as_table(rows: wp.array) -> wp.array:
+    """Returns an array of vectors, quaternions or poses as a table of numbers that shares its memory."""
+    width = rows.strides[0] // 4
+    return wp.array(ptr=rows.ptr, shape=(len(rows), width), dtype=float, device=rows.device)
+
+
+class Worlds:
+    """``count`` worlds with the same robots and boxes, and with plants of their own.
+
+    Args:
+        model: plants of all worlds, and what stands still. Tree t of world w has the number ``t * count + w``. All
+            worlds are at the same place.
+        count: number of worlds.
+        robots: robots that each world has, at the poses of their descriptions.
+        parameters: numbers of the physics. Nothing sleeps in a batch.
+        device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
+        slots: number of contacts that the plants of one world can have at once. Further contacts are left out, and
+            counted in :attr:`dropped`.
+
+    Raises :class:`ValueError` if the number of trees does not fit or a tree needs substeps,
+    :class:`~vinesim.worlds.errors.MissingExtra` without mujoco_warp.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        count: int,
+        *,
+        robots: Sequence[RobotSpec] = (),
+        parameters: PhysicsParameters = PhysicsParameters(),
+        device: str = "cpu",
+        slots: int = DEFAULT_SLOTS,
+    ) -> None:
+        parameters = msgspec.structs.replace(parameters, sleep=False, bunch_pool_size=0)
+        self.model = model
+        self.count = count
+        self.parameters = parameters
+        rigid = RigidWorld(model, parameters=parameters)
+        for robot in robots:
+            rigid.add_robot(robot)
+        self.bodies = RigidBatch(rigid, count, device)
+        """Robots and boxes."""
+        self.plants = ArticulationSolver(model, State.at_rest(model), parameters, device=device)
+        """Trees."""
+        self.plants.wake(np.arange(len(model.tree_first)))
+        self.plants.forward_kinematics()
+        self.contacts = BatchContacts(self.plants, parameters, slots=slots, bodies=self.bodies)
+        """Contacts of the plants."""
+        self.plants.upload()
+        self._resets = wp.zeros(count, dtype=wp.bool, device=device)
+        self._reset = self._reset_graph(device)
+
+    def _reset_graph(self, device: str) -> KernelGraph:
+        """Returns the launches that return worlds to the states that they have now."""
+        arrays = self.plants.launches.resident_arrays
+        launches = []
+        for name in _BODY_STATE:
+            rows = _as_table(arrays[name])
+            given = [self.count, self._resets, arrays["body_tree"], wp.clone(rows)]
+            launches.append(KernelLaunch(restore_bodies, given, [rows], threads=rows.shape[0], width=rows.shape[1]))
+        bodies = self.bodies
+        for rows in (*bodies.state_arrays(), bodies.targets, bodies.base_velocity, bodies.base_targets):
+            if rows.size:
+                given = [self._resets, wp.clone(rows)]
+                launches.append(KernelLaunch(restore_worlds, given, [rows], threads=self.count, width=rows.shape[1]))
+        return KernelGraph(*launches, self.contacts.forget(self._resets), device=device)
+
+    def reset(self, worlds: np.ndarray | wp.array | None = None) -> None:
+        """Return worlds to their first states, with the targets that their robots had then.
+
+        ``worlds``: bool [world], whether each world is reset; None: all are. Between two calls of :meth:`step`.
+        """
+        if worlds is None:
+            self._resets.fill_(True)
+        else:
+            self._resets.assign(worlds)
+        self._reset()
+
+    @property
+    def dt(self) -> float:
+        """[s] Duration of a step."""
+        return self.parameters.dt
+
+    @property
+    def tick(self) -> int:
+        """Number of steps so far."""
+        return self.plants.tick
+
+    @property
+    def dropped(self) -> np.ndarray:
+        """[world] Number of contacts left out since the start because the world had no room for them."""
+        return self.contacts.dropped
+
+    def step(self, steps: int = 1) -> None:
+        """Advance all worlds by ``steps`` steps."""
+        self.plants.advance(steps, self._between)
+
+    def _between(self) -> None:
+        """Launch what happens between the prediction and the integration of the plants."""
+        self.bodies.predict()
+        self.contacts.solve()
+        self.bodies.integrate()
+
+    def download(self) -> None:
+        """Copy the states of all plants to the host: afterwards ``plants.state`` holds their poses."""
+        self.plants.download()
+        self.plants.forward_kinematics()
