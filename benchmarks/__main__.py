@@ -11,8 +11,8 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from benchmarks.transfer import OPTIONS as TRANSFER_OPTIONS
 from benchmarks.support.announcement import announce
+from benchmarks.transfer import OPTIONS as TRANSFER_OPTIONS
 from vinesim.cli.bench import print_measurement
 from vinesim.core.errors import UsageError
 from vinesim.scene.values import Measurement
@@ -75,11 +75,11 @@ def _example_signals(runs: int, seed: int) -> Iterator[Measurement]:
     return _call("example_signals:example_signals")(runs, seed, announce)
 
 
-def _fuzz(messages: int, false_messages: int) -> Iterator[Measurement]:
-    for option, value in (("messages", messages), ("false-messages", false_messages)):
+def _fuzz(messages: int, false_messages: int, seed: int) -> Iterator[Measurement]:
+    for option, value in (("messages", messages), ("false-messages", false_messages), ("seed", seed)):
         if value < 0:
             raise UsageError(f"--{option} is {value}: give 0 or more")
-    return _call("message_fuzz:fuzz")(messages, false_messages)
+    return _call("message_fuzz:fuzz")(messages, false_messages, seed)
 
 
 def _file_fuzz(files: int, seed: int, first: int, kinds: str) -> Iterator[Measurement]:
@@ -118,12 +118,56 @@ def _many_actors(
     return _call("many_actors:many_actors")(clients, apart, seconds, processes, real_time_factor, limit, counts)
 
 
-def _soak(minutes: float, real_time_factor: float | None) -> Iterator[Measurement]:
+def _soak(
+    minutes: float,
+    real_time_factor: float | None,
+    robots: int,
+    people: int,
+    sensor_hz: float,
+    kill_every: float,
+    record: pathlib.Path | None,
+) -> Iterator[Measurement]:
     if minutes <= 0.0:
         raise UsageError(f"--minutes is {minutes:g}: give more than 0")
     if real_time_factor is not None and not 0.01 <= real_time_factor <= 1.0:
         raise UsageError(f"--real-time-factor is {real_time_factor:g}: give 0.01 to 1")
-    return _call("soak:soak")(minutes, real_time_factor, announce)
+    if robots < 1:
+        raise UsageError(f"--robots is {robots}: give 1 or more")
+    if people < 0:
+        raise UsageError(f"--people is {people}: give 0 or more")
+    if sensor_hz <= 0.0:
+        raise UsageError(f"--sensor-hz is {sensor_hz:g}: give more than 0")
+    if kill_every < 0.0:
+        raise UsageError(f"--kill-every is {kill_every:g}: give 0 or more")
+    cast = _call("soak:Cast")(
+        robots=robots,
+        people=people,
+        real_time_factor=real_time_factor,
+        sensor_hz=sensor_hz,
+        kill_every=kill_every,
+    )
+    return _call("soak:soak")(cast, minutes, record, announce)
+
+
+def _joins(joins: int) -> Iterator[Measurement]:
+    if joins < 1:
+        raise UsageError(f"--joins is {joins}: give 1 or more")
+    return _call("joins:joins")(joins, announce)
+
+
+def _starvation(times: int, seed: int) -> Iterator[Measurement]:
+    for option, value, least in (("times", times, 1), ("seed", seed, 0)):
+        if value < least:
+            raise UsageError(f"--{option} is {value}: give {least} or more")
+    return _call("starvation:starvation")(times, seed, announce)
+
+
+def _hostile_actor(minutes: float, seed: int) -> Iterator[Measurement]:
+    if minutes <= 0.0:
+        raise UsageError(f"--minutes is {minutes:g}: give more than 0")
+    if seed < 0:
+        raise UsageError(f"--seed is {seed}: give 0 or more")
+    return _call("hostile_actor:hostile_actor")(minutes, seed, announce)
 
 
 def _coverage(seeds: int, first: int, plants: str, tracks: str) -> Iterator[Measurement]:
@@ -236,6 +280,7 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
                 "default": 0,
                 "help": "number of series of false messages (needs hypothesis)",
             },
+            "seed": {"type": int, "default": 0, "help": "seed; runs with different seeds are parts of a long one"},
         },
     ),
     "file_fuzz": (
@@ -284,15 +329,45 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
             "out": {"help": "file for the table in Markdown"},
         },
     ),
+    "hostile_actor": (
+        _hostile_actor,
+        "an admitted actor tries everything that it may: processor time of a step of another client (Linux)",
+        {
+            "minutes": {"type": float, "default": 10.0, "help": "time under attack"},
+            "seed": {"type": int, "default": 0, "help": "seed of the broken messages"},
+        },
+    ),
+    "joins": (
+        _joins,
+        "memory of a server and of a client while people join and leave (Linux)",
+        {"joins": {"type": int, "default": 3000, "help": "number of people"}},
+    ),
+    "starvation": (
+        _starvation,
+        "clients and servers that get no processor time for a while: time until all are served (Linux)",
+        {
+            "times": {"type": int, "default": 100, "help": "number of times"},
+            "seed": {"type": int, "default": 0, "help": "seed of the durations"},
+        },
+    ),
     "soak": (
         _soak,
-        "memory, threads and open files in a long run (Linux)",
+        "delivery, open files, memory, recovery of the server and publishing in a long run (Linux)",
         {
             "minutes": {"type": float, "default": 60.0, "help": "measured time"},
             "real-time-factor": {
                 "type": float,
                 "help": "rate of the world's time (default: as fast as all clients can follow)",
             },
+            "robots": {"type": int, "default": 4, "help": "number of robots"},
+            "people": {"type": int, "default": 2, "help": "number of people"},
+            "sensor-hz": {"type": float, "default": 1.0, "help": "rate of each robot's pictures in real time"},
+            "kill-every": {
+                "type": float,
+                "default": 0.0,
+                "help": "minutes between two kills of the server, which starts again at once; 0: none",
+            },
+            "record": {"type": pathlib.Path, "help": "file of the figures so far, written every five minutes"},
         },
     ),
 }

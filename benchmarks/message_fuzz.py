@@ -461,14 +461,15 @@ def attack(count: int, seed: int = 0, *, kind: str = "robot", is_stranger: bool 
     return done
 
 
-def fuzz(count: int = MESSAGE_COUNT, false_messages: int = 0) -> Iterator[Measurement]:
-    """Measure attacks of ``count`` corrupted messages, and of ``false_messages`` series of well-formed false ones."""
+def fuzz(count: int = MESSAGE_COUNT, false_messages: int = 0, seed: int = 0) -> Iterator[Measurement]:
+    """Measure attacks of ``count`` corrupted messages, and of ``false_messages`` series of well-formed false ones. Runs
+    with different seeds are parts of a long one."""
     for case, share, kind, is_stranger in (
         ("a person that was admitted", 0.45, "human", False),
         ("a robot that was admitted", 0.45, "robot", False),
         ("a stranger", 0.1, "human", True),
     ):
-        done = attack(round(share * count), kind=kind, is_stranger=is_stranger) if count else Attack()
+        done = attack(round(share * count), seed, kind=kind, is_stranger=is_stranger) if count else Attack()
         for what, value, unit in (
             ("broken messages sent", done.sent, ""),
             ("arrived at a client", done.arrived, ""),
@@ -481,5 +482,5 @@ def fuzz(count: int = MESSAGE_COUNT, false_messages: int = 0) -> Iterator[Measur
     for kind in ("human", "robot") if false_messages else ():
         from benchmarks.support.false_messages import send_false_messages  # needs hypothesis
 
-        told = send_false_messages(false_messages // 2, kind=kind)
+        told = send_false_messages(false_messages // 2, seed=seed, kind=kind)
         yield Measurement("fuzz", f"well-formed false messages of a {kind}, no law broken", float(told), "")

@@ -1,4 +1,5 @@
-"""``python -m benchmarks soak``: memory, threads and open files of robots, people and a recorder in a long run.
+"""``python -m benchmarks soak``: five figures of robots, people and a recorder in a long run: share of delivered
+messages, open files and threads, growth of memory, recovery after a killed server, and time to publish.
 
 All programs are processes on this machine, started as users start them: a server that keeps its state in a folder,
 robots whose sensors publish to ROS listeners, people who hold and pull bunches, and a recorder.
@@ -16,9 +17,10 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.support.link_probe import KINDS, LinkProbe
 from vinesim.bench.live_client import own_processes
 from vinesim.bench.process_memory import ProcessHistory, ProcessSampler, check_proc
-from vinesim.client.programs import START_TIMEOUT, Program, ProgramFailed, ProgramGroup, RosListener
+from vinesim.client.programs import START_TIMEOUT, Program, ProgramFailed, ProgramGroup, RosListener, free_port
 from vinesim.client.tasks import start_poses
 from vinesim.core.frames import to_yaw
 from vinesim.ros import middleware
@@ -34,6 +36,10 @@ SAMPLE_PERIOD = 5.0
 """Time between two samples of all processes [s]."""
 POLL_PERIOD = 0.1
 """Time between two reads of the processes' output [s]."""
+RECORD_PERIOD = 300.0
+"""Time between two records of the figures so far [s]."""
+RECOVERY_BOUND = 15.0
+"""Largest accepted time from the kill of a server until all clients are served by its successor [s]."""
 SENSOR_HZ = 1.0
 """Rate of pictures and scans of each robot in real time [Hz]."""
 PERSON_DISTANCE = 1.5
@@ -60,6 +66,10 @@ class Cast:
     records: bool = True
     real_time_factor: float | None = None
     """Rate of the world's time. None: as fast as all clients can follow."""
+    sensor_hz: float = SENSOR_HZ
+    """Rate of pictures and scans of each robot in real time [Hz]."""
+    kill_every: float = 0.0
+    """Time between two kills of the server, which is started again at once [min]; 0: it is never killed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,20 +82,44 @@ class SoakResult:
     """Numbers of malformed messages, faults and restarts, by name, of all processes together."""
     tick_hz: float
     """Mean tick rate of the slowest client [Hz]."""
+    minutes: float = 0.0
+    """Time that was measured [min]."""
+    link: dict[str, float] = dataclasses.field(default_factory=dict)
+    """Figures of the probe of the server's link, by name with unit."""
+    kills: int = 0
+    """Number of times that the server was killed."""
+    recoveries: list[float] = dataclasses.field(default_factory=list)
+    """Time from each kill of the server until its successor served all clients [s]."""
 
     def of_kind(self, kind: str) -> list[ProcessHistory]:
         """Returns the histories of all processes of one kind."""
         return [history for (name, _), history in self.histories.items() if name == kind]
 
 
-def soak(minutes: float, real_time_factor: float | None, announce: Callable[[str], None]) -> Iterator[Measurement]:
-    """Run for ``minutes`` [min] and measure. ``announce`` is called with a line of text from time to time."""
-    yield from measurements(run_soak(Cast(real_time_factor=real_time_factor), minutes, announce))
+def soak(
+    cast: Cast, minutes: float, record: pathlib.Path | None, announce: Callable[[str], None]
+) -> Iterator[Measurement]:
+    """Run for ``minutes`` [min] and measure. ``announce`` is called with a line of text from time to time.
+
+    ``record``: file of the figures so far, as lines of JSON. It is written anew every :data:`RECORD_PERIOD`.
+    """
+
+    def write(result: SoakResult) -> None:
+        if record is not None:
+            lines = [json.dumps(dataclasses.asdict(one)) for one in measurements(result)]
+            part = record.with_name(record.name + ".part")
+            part.write_text("\n".join(lines) + "\n")
+            part.replace(record)
+
+    result = run_soak(cast, minutes, announce, write)
+    write(result)
+    yield from measurements(result)
 
 
 def measurements(result: SoakResult) -> Iterator[Measurement]:
     """Yields for each kind of process its memory, its growth, and how many more threads or open files it has in the
-    second half of the run than in the first."""
+    second half of the run than in the first; then the figures of the link and of the server's kills."""
+    yield Measurement("soak", "measured time", result.minutes, "min")
     for kind in dict.fromkeys(name for name, _ in result.histories):
         histories = result.of_kind(kind)
         memory = float(np.mean([history.samples[-1].memory for history in histories]))
@@ -98,36 +132,78 @@ def measurements(result: SoakResult) -> Iterator[Measurement]:
             change = max(history.change(what) for history in histories)
             yield Measurement("soak", f"{case}: more {what} in the second half", change, "1", "budget, at most", 0.0)
     yield Measurement("soak", "least tick rate of a client", result.tick_hz, "Hz")
+    for name, value in result.link.items():
+        what, _, unit = name.rpartition(" in ")
+        yield Measurement("soak", what, value, unit)
+    if result.kills:
+        yield Measurement("soak", "kills of the server", result.kills, "1")
+        recovered = len(result.recoveries)
+        yield Measurement(
+            "soak", "kills after which all clients were served again", recovered, "1", "kills", result.kills
+        )
+    if result.recoveries:
+        worst = max(result.recoveries)
+        mean = float(np.mean(result.recoveries))
+        yield Measurement("soak", "from a kill of the server until all are served, mean", mean, "s")
+        case = "from a kill of the server until all are served, at most"
+        yield Measurement("soak", case, worst, "s", "budget, at most", RECOVERY_BOUND, RECOVERY_BOUND / worst)
     for name, count in sorted(result.counts.items()):
         yield Measurement("soak", name.replace("_", " "), count, "1")
 
 
-def run_soak(cast: Cast, minutes: float, announce: Callable[[str], None]) -> SoakResult:
+def run_soak(
+    cast: Cast,
+    minutes: float,
+    announce: Callable[[str], None],
+    record: Callable[[SoakResult], None] = lambda _: None,
+) -> SoakResult:
     """Start all programs, wait until they are ready, sample them for ``minutes`` [min], and end them.
 
-    Raises :class:`ProgramFailed` if a process ends too early, :class:`ProcUnavailable` on systems without /proc.
+    ``record`` is called with the result so far every :data:`RECORD_PERIOD`. Raises :class:`ProgramFailed` if a
+    process ends too early, :class:`ProcUnavailable` on systems without /proc.
     """
     check_proc()
     with own_processes() as group, tempfile.TemporaryDirectory() as folder:
         run = _Run(group, cast, pathlib.Path(folder))
         run.wait_until_ready()
         announce(f"all ready: {len(run.processes)} programs; {minutes:g} minutes to go")
-        start = time.monotonic()
-        end = start + 60.0 * minutes
-        settled = start + 60.0 * min(SETTLING, minutes / 3.0)
-        due = said = start
-        while (now := time.monotonic()) < end:
-            run.read()
-            if now >= due:
-                due = now + SAMPLE_PERIOD
-                run.sampler.sample(now)
-            if now >= said + 60.0:
-                said = now
-                run.forget_messages()
-                announce(f"{(now - start) / 60.0:.0f} of {minutes:g} minutes; {run.progress()}")
-            time.sleep(POLL_PERIOD)
-        histories, ended = settle(run.sampler.histories, start, settled, end)
-        return SoakResult(histories, run.end() | ended, run.least_rate())
+        with LinkProbe(run.endpoint) as probe:
+            _measure(run, probe, minutes, announce, record)
+            ended = time.monotonic()
+        return run.result(probe, ended, run.end())
+
+
+def _measure(
+    run: _Run,
+    probe: LinkProbe,
+    minutes: float,
+    announce: Callable[[str], None],
+    record: Callable[[SoakResult], None],
+) -> None:
+    """Sample all processes, and kill the server at its times, for ``minutes`` [min]."""
+    run.start = start = time.monotonic()
+    run.settling = 60.0 * min(SETTLING, minutes / 3.0)
+    end = start + 60.0 * minutes
+    due = said = recorded = start
+    pause = 60.0 * run.cast.kill_every
+    kill_at = start + run.settling + pause if pause else float("inf")
+    while (now := time.monotonic()) < end:
+        run.read()
+        if now >= due:
+            due = now + SAMPLE_PERIOD
+            run.sampler.sample(now)
+        if kill_at <= now < end - 60.0:
+            kill_at = now + pause
+            run.kill_server()
+            announce("killed the server and started it again")
+        if now >= said + 60.0:
+            said = now
+            run.forget_messages()
+            announce(f"{(now - start) / 60.0:.0f} of {minutes:g} minutes; {run.progress()}")
+        if now >= recorded + RECORD_PERIOD:
+            recorded = now
+            record(run.result(probe, now, run.faults()))
+        time.sleep(POLL_PERIOD)
 
 
 def settle(
@@ -153,34 +229,87 @@ class _Run:
     def __init__(self, group: ProgramGroup, cast: Cast, folder: pathlib.Path) -> None:
         """Start the programs; their files go below ``folder``."""
         self._folder = folder
-        self.server = group.start(
-            "server",
-            "-m",
-            "vinesim",
-            "server",
-            "--listen",
-            "tcp/127.0.0.1:0",
-            "--status",
-            "json",
-            "--state-dir",
-            str(folder / "state"),
-            "--real-time-factor",
-            "auto" if cast.real_time_factor is None else f"{cast.real_time_factor:g}",
-        )
+        self._group = group
+        self.cast = cast
+        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
+        self.server = self._start_server()
         self._figures: dict[str, Any] = json.loads(self.server.next_line(START_TIMEOUT))
-        self._endpoint = self._figures["endpoints"][0]
         self.clients: dict[str, Program] = {}
         self._newest: dict[str, dict[str, Any]] = {}
+        self._heard: dict[str, float] = {}
+        """Time of the newest status line of each client [s]."""
+        self.start = 0.0
+        """Time at which the measurement began [s]."""
+        self.settling = 0.0
+        """Time in which the memory of a process may grow before it is measured [s]."""
+        self._killed_at: float | None = None
+        """Time of the last kill of the server [s], until its successor serves all clients."""
+        self._listed_at: float | None = None
+        """Time at which the successor had all clients in its list [s]."""
+        self._killed: set[int] = set()
+        """Process ids of the killed servers."""
+        self._refused = self._malformed = 0
+        """Counts of the killed servers."""
+        self._recoveries: list[float] = []
         self.listeners: list[RosListener] = []
         self.processes: list[tuple[str, Program]] = [("server", self.server)]
         self._start_clients(group, cast)
         self.recorder = None
         if cast.records:
             self.recorder = group.start(
-                "recorder", "-m", "vinesim", "record", str(folder / "soak.mcap"), "--connect", self._endpoint
+                "recorder", "-m", "vinesim", "record", str(folder / "soak.mcap"), "--connect", self.endpoint
             )
             self.processes.append(("recorder", self.recorder))
         self.sampler = ProcessSampler([(kind, process.child.pid) for kind, process in self.processes])
+
+    def _start_server(self) -> Program:
+        factor = self.cast.real_time_factor
+        return self._group.start(
+            "server",
+            "-m",
+            "vinesim",
+            "server",
+            "--listen",
+            self.endpoint,
+            "--status",
+            "json",
+            "--state-dir",
+            str(self._folder / "state"),
+            "--real-time-factor",
+            "auto" if factor is None else f"{factor:g}",
+        )
+
+    def kill_server(self) -> None:
+        """Kill the server and start another one in its place."""
+        self._killed_at = time.monotonic()
+        self._listed_at = None
+        self._refused += self._figures["refused"]
+        self._malformed += self._figures["malformed"]
+        self._killed.add(self.server.child.pid)
+        self.server.child.kill()
+        self.server.child.wait()
+        self.server = self._start_server()
+        self._figures = {"refused": 0, "malformed": 0, "actors": ()}
+        self.processes.append(("server", self.server))
+        self.sampler.add("server", self.server.child.pid)
+
+    def _watch_recovery(self) -> None:
+        """Note the recovery if the successor of a killed server has all clients in its list, and all clients say
+        later that they are served and see each other."""
+        if self._killed_at is None:
+            return
+        now = time.monotonic()
+        names = {*self.clients}
+        if self._listed_at is None:
+            if names <= {*map(_actor, self._figures["actors"])}:
+                self._listed_at = now
+            return
+        for name, status in self._newest.items():
+            sees = {*status["others"], name}
+            if self._heard[name] <= self._listed_at or status["network"] or not names <= sees:
+                return
+        self._recoveries.append(now - self._killed_at)
+        self._killed_at = None
 
     def _start_clients(self, group: ProgramGroup, cast: Cast) -> None:
         """Start robots one behind the other, of which the first pushes a bunch, and people next to bunches of their
@@ -190,7 +319,7 @@ class _Run:
         first = start_poses.start_pose(scene, 0)
         pushed = start_poses.find_reachable_bunch(model, first)
         with_ros = middleware.unavailable_reason() is None
-        sensor_hz = SENSOR_HZ / (cast.real_time_factor or 1.0)  # rate in simulated time
+        sensor_hz = cast.sensor_hz / (cast.real_time_factor or 1.0)  # rate in simulated time
         for i in range(cast.robots):
             name = f"robot_{i + 1}"
             pose = start_poses.start_pose(scene, 0, queue=i)
@@ -212,7 +341,7 @@ class _Run:
             )
 
     def _start_client(self, group: ProgramGroup, role: str, name: str, cast: Cast, options: list[str]) -> None:
-        common = ["--connect", self._endpoint, "--scene", cast.scene, "--status", "json"]
+        common = ["--connect", self.endpoint, "--scene", cast.scene, "--status", "json"]
         self.clients[name] = group.start(
             name,
             "-m",
@@ -234,12 +363,14 @@ class _Run:
         for name, client in self.clients.items():
             for line in client.new_lines():
                 self._newest[name] = json.loads(line)
+                self._heard[name] = time.monotonic()
         for line in self.server.new_lines():
             self._figures = json.loads(line)
         for listener in self.listeners:
             listener.missing()
         if self.recorder is not None:
             self.recorder.new_lines()
+        self._watch_recovery()
 
     def forget_messages(self) -> None:
         """Let the listeners drop the times of past messages, which they keep for statistics: 3 MB an hour."""
@@ -264,16 +395,61 @@ class _Run:
         memory = self.sampler.memory()
         rates = " ".join(f"{values['tick_hz']:.0f}" for values in self._newest.values())
         faults = {name: values["faults"] for name, values in self._newest.items() if values["faults"]}
-        return f"{memory:.0f} MB in all, ticks {rates} Hz, faults {faults or 'none'}"
+        recovered = f", recovered after {self._recoveries[-1]:.1f} s" if self._recoveries else ""
+        return f"{memory:.0f} MB in all, ticks {rates} Hz, faults {faults or 'none'}{recovered}"
 
     def least_rate(self) -> float:
         """Returns the mean tick rate of the slowest client so far [Hz]."""
         return min((values["tick_hz"] for values in self._newest.values()), default=0.0)
 
+    def faults(self) -> dict[str, int]:
+        """Returns the counts so far: of the servers, and of the newest status lines of the clients."""
+        counts = {
+            "malformed, server": self._malformed + self._figures["malformed"],
+            "refused, server": self._refused + self._figures["refused"],
+        }
+        for status in self._newest.values():
+            for key, count in status["faults"].items():
+                counts[f"{key}, clients"] = counts.get(f"{key}, clients", 0) + count
+        return counts
+
+    def result(self, probe: LinkProbe, end: float, counts: dict[str, int]) -> SoakResult:
+        """Returns what was measured until ``end`` [s], with ``counts``."""
+        histories, ended = settle(self.sampler.histories, self.start, self.start + self.settling, end)
+        ended = {name: count for name, count in ended.items() if int(name.split()[-2]) not in self._killed}
+        link: dict[str, float] = {}
+        for kind in KINDS:
+            link[f"messages of the probe, {kind}: published in 1"] = probe.sent[kind]
+            link[f"messages of the probe, {kind}: not published, the server was gone in 1"] = probe.unsent[kind]
+            link[f"messages of the probe, {kind}: delivered in 1"] = probe.delivered(kind)
+            link[f"messages of the probe, {kind}: published to arrived, p50 in ms"] = 1e3 * probe.delay(kind, 50.0)
+            link[f"messages of the probe, {kind}: published to arrived, p99 in ms"] = 1e3 * probe.delay(kind, 99.0)
+        link["call that publishes, p50 in ms"] = 1e3 * probe.call(50.0)
+        link["call that publishes, p99 in ms"] = 1e3 * probe.call(99.0)
+        link["pictures and scans of the robots: delivered in 1"] = self._delivered_frames()
+        return SoakResult(
+            histories,
+            counts | ended,
+            self.least_rate(),
+            (end - self.start) / 60.0,
+            link,
+            len(self._killed),
+            list(self._recoveries),
+        )
+
+    def _delivered_frames(self) -> float:
+        """Returns the share of due pictures and scans that were delivered; 1 without any."""
+        delivered = sum(status["frames_delivered"] for status in self._newest.values())
+        dropped = sum(status["frames_dropped"] for status in self._newest.values())
+        return delivered / (delivered + dropped) if delivered + dropped else 1.0
+
     def end(self) -> dict[str, int]:
         """End the clients in order and return their counts. A client that fails now adds to the counts: the run itself
         is over."""
-        counts = {"malformed, server": self._figures["malformed"], "refused, server": self._figures["refused"]}
+        counts = {
+            "malformed, server": self._malformed + self._figures["malformed"],
+            "refused, server": self._refused + self._figures["refused"],
+        }
         for client in self.clients.values():
             client.interrupt()
         reports = []
@@ -293,3 +469,8 @@ class _Run:
 
 def _pose_option(place: np.ndarray, yaw: float) -> list[str]:
     return ["--pose", *(f"{value:.4f}" for value in (*place, yaw))]
+
+
+def _actor(text: str) -> str:
+    """Returns the name of an actor in the server's list, which may have the world before it."""
+    return text.rpartition("/")[2]

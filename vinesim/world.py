@@ -149,12 +149,13 @@ class Physics:
 
     @property
     def faults(self) -> dict[str, int]:
-        """Number of faults so far, by kind: trees and robots stopped, trees slowed, contacts dropped, geoms skipped,
-        grasps refused, cuts moved to a joint."""
+        """Number of faults so far, by kind: trees and robots stopped, trees slowed, objects in heaps, contacts dropped,
+        geoms skipped, grasps refused, cuts moved to a joint."""
         return {
             "trees_stopped": int(self.fault_guard.count.sum()),
             "trees_slowed": self.fault_guard.slowed,
             "robots_stopped": self.rigid.faults,
+            "objects_in_heaps": self.rigid.heaped,
             "contacts_dropped": self.contact_solver.dropped_contacts,
             "geoms_skipped": self.contact_solver.skipped_geoms,
             "grasps_refused": self.grasp_manager.refused_grasps,

@@ -53,7 +53,7 @@ def test_processes_that_end_or_get_another_name_while_memory_settles_are_no_erro
     )
     assert list(found) == [("client", 1), ("standby", 2)]
     assert ended == {"helper 3 ended": 1}
-    assert len(list(measurements(SoakResult(found, ended, 100.0)))) == 10
+    assert len(list(measurements(SoakResult(found, ended, 100.0)))) == 11
 
 
 def test_a_process_that_is_started_again_settles_from_its_own_start() -> None:
@@ -113,6 +113,7 @@ def test_a_client_that_ends_badly_does_not_cost_the_figures(tmp_path: pathlib.Pa
     run._folder = tmp_path
     run._figures = {"malformed": 0, "refused": 1}
     run.clients = {"robot_1": cast(Program, Killed())}
+    run._refused = run._malformed = 0
     run._newest = {"robot_1": {"faults": {"messages_refused": 3}, "sensor_restarts": 2}}
     counts = run.end()
     assert counts.pop("robot_1 without a report (ended with exit code -9)") == 1

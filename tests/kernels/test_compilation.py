@@ -205,3 +205,22 @@ def test_a_module_of_which_compilers_die_costs_the_others_nothing(fake: Fake, ca
 def test_a_module_that_cannot_be_compiled_is_logged(fake: Fake, caplog: pytest.LogCaptureFixture) -> None:
     assert compile_kernels(("rigid.joint_servos", "stereo.stereo_input")) == 1
     assert "rigid.joint_servos was not compiled in advance: no" in caplog.text
+
+
+@pytest.mark.slow
+def test_a_damaged_file_of_compiled_kernels_is_made_anew_with_one_line(tmp_path):
+    """Of one module the code has another byte, of one the code ends early, of one the description is no JSON."""
+    first, _ = compiled(start(tmp_path))
+    assert first == 3
+    codes = sorted((tmp_path / "warp").glob("*/wp_vinesim*/*.o"))
+    descriptions = sorted((tmp_path / "warp").glob("*/wp_vinesim*/*.meta"))
+    assert len(codes) == len(descriptions) == 3
+    content = bytearray(codes[0].read_bytes())
+    content[len(content) // 2] ^= 1
+    codes[0].write_bytes(content)
+    codes[1].write_bytes(codes[1].read_bytes()[:100])
+    descriptions[2].write_text("{")
+    again, lines = compiled(start(tmp_path))
+    assert again == 3
+    assert sum("are damaged: compiling them again" in line for line in lines) == 3
+    assert compiled(start(tmp_path))[0] == 0

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from vinesim.net.codec.control import Hello, Welcome, encode_hello, encode_welcome
 from vinesim.net.codec.header import PROTOCOL
-from vinesim.net.server.admission import PROVISIONAL_TIMEOUT, AdmissionControl, JoinLimits, SceneId
+from vinesim.net.server.admission import MAX_DEPARTED, PROVISIONAL_TIMEOUT, AdmissionControl, JoinLimits, SceneId
 from vinesim.net.transport import zenoh_admission
 
 
@@ -184,6 +184,27 @@ def test_all_actors_of_a_world_share_one_scene(events):
         assert len(set(members.values())) <= 1
         assert len(members) <= 2
         assert admission.scene_of("w").digest == next(iter(members.values()), "")
+
+
+def test_the_last_records_of_an_actor_that_has_left_are_its_own():
+    """Until another session has the name; a spectator has none; and only so many are known."""
+    admission = AdmissionControl()
+    for name, kind in (("ada", "robot"), ("eva", "spectator")):
+        admission.decide("w", name, f"s-{name}", encode_hello(Hello(name, kind=kind)), 0.0)
+        admission.on_join("w", name, f"s-{name}")
+    admission.on_leave("w", "ada", "s-ada")
+    admission.end_session("s-eva")
+    assert [admission.publisher("w", name) for name in ("ada", "eva", "bob")] == ["s-ada", "s-eva", ""]
+    admission.on_leave("w", "eva", "s-eva")
+    assert admission.publisher("w", "eva") == ""
+    admission.on_join("w", "ada", "another")
+    assert admission.publisher("w", "ada") == "another"
+    for number in range(MAX_DEPARTED):
+        admission.decide("w", f"a{number}", f"s{number}", encode_hello(Hello(f"a{number}")), 0.0)
+        admission.on_leave("w", f"a{number}", f"s{number}")
+    admission.on_leave("w", "ada", "another")
+    assert admission.publisher("w", "ada") == ""
+    assert admission.publisher("w", "a255") == "s255"
 
 
 class _SlowlyRouted:

@@ -24,36 +24,48 @@ from vinesim.net.server.journal import Journal
 from vinesim.net.server.server import Server
 from vinesim.net.transport import name_holders, zenoh_bus
 from vinesim.net.transport.bus import JoinRejected, NameTaken
+from vinesim.net.transport.signatures import Identity
 from vinesim.net.transport.zenoh_bus import ZenohBus
 from vinesim.net.transport.zenoh_session import SessionRefused, close_session, config, open_session
 from vinesim.scene.ids import ObjectKind, object_id
 from vinesim.scene.triangles import digest_of, encode_triangles
 
 HELLO = 16
+IDENTITIES: dict[str, Identity] = {}
+"""Keys of the strangers' sessions, by session."""
+
+
+def seal(session: zenoh.Session, key: str, payload: bytes) -> bytes:
+    return IDENTITIES[str(session.zid())].seal(key, payload)
 
 
 @contextlib.contextmanager
 def stranger(endpoint: str):
-    """A Zenoh session of a program that is no vinesim."""
-    session = open_session(config("client", connect__endpoints=[endpoint]))
+    """A Zenoh session of a program that is no vinesim, and signs as vinesim does."""
+    identity = Identity()
+    session = open_session(config("client", connect__endpoints=[endpoint], id=identity.session))
+    IDENTITIES[identity.session] = identity
     try:
         yield session
     finally:
         close_session(session)
+        del IDENTITIES[identity.session]
 
 
 def ask_to_join(session: zenoh.Session, world: str, name: str, who: str = "", **more) -> Welcome:
     """Send a join query as another program would: whatever the names are."""
     payload = pack(HELLO, Hello(name, digest="D", scene="s", **more))
-    replies = session.get(f"vs/1/{world}/join/{name}/{who or session.zid()}", payload=payload, timeout=5.0)
+    key = f"vs/1/{world}/join/{name}/{who or session.zid()}"
+    replies = session.get(key, payload=payload, attachment=seal(session, key, payload), timeout=5.0)
     (reply,) = (reply.ok for reply in replies if reply.ok is not None)
     return decode_welcome(reply.payload.to_bytes())
 
 
 def put_record(session: zenoh.Session, world: str, name: str, number: int = 0) -> None:
     record = RetainedRecord(object_id(ObjectKind.BUNCH, number), 1, 0, name, pose=(0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
-    source = zenoh.SourceInfo(session.id, 0)
-    session.put(f"vs/1/{world}/fact/0/0/{name}", encode_records([record]), source_info=source)
+    key = f"vs/1/{world}/fact/0/0/{name}"
+    payload = encode_records([record])
+    session.put(key, payload, attachment=seal(session, key, payload))
 
 
 def journal_size(folder: pathlib.Path, world: str) -> int:
@@ -136,8 +148,9 @@ def offer(session: zenoh.Session, world: str, name: str, payload: bytes) -> Mesh
     wanted = MeshWanted(0)
     while not wanted.refused and wanted.offset < len(payload):
         part = MeshPart(digest, len(payload), wanted.offset, payload[wanted.offset : wanted.offset + MAX_PART])
-        source = zenoh.SourceInfo(session.id, 0)
-        replies = session.get(f"vs/1/{world}/offer/{name}", payload=encode_part(part), source_info=source, timeout=5.0)
+        key = f"vs/1/{world}/offer/{name}"
+        payload = encode_part(part)
+        replies = session.get(key, payload=payload, attachment=seal(session, key, payload), timeout=5.0)
         found = [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
         if not found:
             return None
@@ -248,13 +261,13 @@ def test_a_session_that_is_not_served_is_opened_anew_and_works_as_before(monkeyp
         ada.declare_queryable("hello/ada", lambda _: b"i am ada")
         pose, event = ada.publisher("a/ada"), ada.publisher("own/0/0/ada", reliable=True)
         bobs = bob.publisher("own/0/0/bob", reliable=True)
-        before = ada.source.source_id.zid
+        before = ada.identity.session
         deaf = ada._session.declare_querier("vs/1/vineyard/nowhere/ada")  # matches no server
         ada._admission._querier = deaf
         ada._admission.is_served = False
         assert "is gone" in ada.status_message
         wait(lambda: ada.sessions_opened_anew == 1 and not ada.status_message, "a new session")
-        assert ada.source.source_id.zid != before
+        assert ada.identity.session != before
         assert ada.admissions >= 2
         heard: set = set()
 
@@ -290,6 +303,7 @@ def test_the_memory_of_a_server_and_of_a_client_does_not_grow_with_joins_and_lea
     monkeypatch.setattr(logging.root.manager, "disable", logging.CRITICAL)  # pytest keeps what is logged
     monkeypatch.setattr(admission, "JOIN_BURST_TIME", 1.0)
     monkeypatch.setattr("vinesim.net.server.server.MAX_WARNED", 20)
+    monkeypatch.setattr("vinesim.net.server.server.MAX_KNOWN_SESSIONS", 20)
     monkeypatch.setattr(name_holders, "MAX_FORMER_NAMES", 50)
     monkeypatch.setattr(retained_store, "MAX_BUCKETS", 50)
     monkeypatch.setattr(retained_store, "BURST_TIME", 0.1)

@@ -99,6 +99,20 @@ def test_records_that_the_server_keeps_come_from_the_session_that_joined(server)
         wait(lambda: server.store.count() == 1, "ada's own record")
 
 
+def test_a_record_that_is_put_right_before_leaving_is_kept(server):
+    """The end of a session and its last record reach the server's threads in any order."""
+    with ZenohBus("witness", connect=server.endpoint) as witness:
+        witness.join(hello("witness"))
+        for number in range(20):
+            with ZenohBus("ada", connect=server.endpoint) as ada:
+                ada.join(hello("ada"))
+                publisher = ada.publisher("fact/0/0/ada", reliable=True)
+                wait(lambda publisher=publisher: publisher.matching, "the server's subscription")
+                publisher.put(encode_records([RetainedRecord(object_id(ObjectKind.BOX, number), 9, 0, "ada")]))
+        wait(lambda: server.store.count() + server.foreign == 20, "all records")
+        assert server.foreign == 0
+
+
 def test_a_spectator_publishes_no_records(server):
     with ZenohBus("guest", connect=server.endpoint) as guest:
         guest.join(hello("guest", "spectator"))

@@ -111,11 +111,13 @@ def test_questions_with_wildcards_or_missing_parts_are_counted_and_nothing_ends(
                 assert [reply for reply in session.get(key, payload=payload, timeout=2.0) if reply.ok] == []
         assert server.malformed >= 6
         for key in ("fact", "fact/0/0/ada/more", "fact/0/0/eve"):
-            session.put(f"vs/1/vineyard/{key}", b"", source_info=ada.source)
+            whole = f"vs/1/vineyard/{key}"
+            session.put(whole, b"", attachment=ada.seal(whole, b""))
         wait(lambda: server.foreign == 3, "the records of no actor")
         ada.join(hello("ada"))
         for key in ("fact/ada", "fact/x/y/ada", "fact/0/0/more/ada"):
-            session.put(f"vs/1/vineyard/{key}", b"", source_info=ada.source)
+            whole = f"vs/1/vineyard/{key}"
+            session.put(whole, b"", attachment=ada.seal(whole, b""))
         wait(lambda: server.store.counters.malformed == 3, "the keys without a cell")
         publish(ada, (0, 0), box(1))
         assert snapshot(ada, (0, 0), 1) == [box(1)]

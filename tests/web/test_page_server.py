@@ -226,6 +226,35 @@ def test_a_site_that_gives_this_address_a_name_of_its_own_is_refused(served):
     assert urllib.request.urlopen(request, timeout=deadline(10.0)).read() == b"scene"
 
 
+@pytest.mark.parametrize(
+    "host",
+    ["", "[", "[::1", "127.0.0.1:x", "127.0.0.1:99999999", "a b", "@", "\x7f", "\xe9", "x" * 5000, "127.0.0.1:-1"],
+)
+def test_a_malformed_host_header_is_refused_and_no_error_of_the_server(served, host):
+    _, server = served
+    path = server.address.split("/", 3)[3]
+    with socket.create_connection(("127.0.0.1", server.port), deadline(10.0)) as client:
+        client.sendall(f"GET /{path}scene HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n".encode("latin-1"))
+        answer = b""
+        while part := client.recv(4096):
+            answer += part
+    assert re.match(rb"HTTP/1.[01] 4\d\d ", answer), answer[:100]
+    assert get(server.address + "scene")[0] == 200
+
+
+def test_two_pages_of_one_browser_work_side_by_side():
+    """A browser sends the cookies of one port to all ports of a machine; pages set none. Each page has its own
+    secret."""
+    with PageServer(CountingWorld()) as one, PageServer(CountingWorld()) as other:
+        for _ in range(2):
+            for server in (one, other):
+                status, headers, body = get(server.address + "scene")
+                assert (status, body) == (200, "scene")
+                assert "Set-Cookie" not in headers
+        crossed = one.address.replace(f":{one.port}/", f":{other.port}/")
+        assert get(crossed + "scene")[0] == 403
+
+
 def test_nothing_is_loaded_from_another_host(served):
     """Browsers are told so, and the page's own sources name no other host."""
     _, server = served

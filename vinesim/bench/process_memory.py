@@ -110,10 +110,14 @@ class ProcessSampler:
 
     def __init__(self, roots: Sequence[tuple[str, int]]) -> None:
         """Kind and id of each process that has no parent among them."""
-        self._roots = roots
+        self._roots = list(roots)
         self.histories: dict[tuple[str, int], ProcessHistory] = {}
         """History of each process, by kind and id; the kind of a descendant is its name."""
         self._sampled_at = 0.0
+
+    def add(self, kind: str, pid: int) -> None:
+        """Sample another process and its descendants from now on."""
+        self._roots.append((kind, pid))
 
     def memory(self) -> float:
         """Memory of all processes that ran at the last sample [MB]."""

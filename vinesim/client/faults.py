@@ -19,6 +19,7 @@ DESCRIPTIONS = {
     "trees_stopped": "trees moved too fast, or their state was not finite; they were reset to rest",
     "trees_slowed": "joints of trees turned faster than max_joint_rate and were slowed down, which removes energy",
     "robots_stopped": "robots or boxes moved too fast, or their state was not finite; they were put back",
+    "objects_in_heaps": "objects passed through everything for a step, because many had been put into each other",
     "contacts_dropped": "contacts were left out, because there were more than the capacity",
     "geoms_skipped": "static geoms near a tree were left out, because there are more than max_static_geoms_per_tree",
     "grasps_refused": "hands could not grasp plants, because too many bodies of plants were held already",

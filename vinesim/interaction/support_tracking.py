@@ -32,6 +32,8 @@ GROUND = ""
 """Name of the ground as a support; boxes are ``box/3``, links ``actor/link``."""
 
 _STATIC, _BOX, _LINK, _BUNCH, _HUMAN = range(5)
+FARTHEST = 1e5
+"""Largest coordinate of an object that rests on a support [m], as large as messages may have."""
 _NONE = -1
 _NO_PAIRS = np.zeros((0, 2), np.int64)
 
@@ -226,12 +228,14 @@ class SupportTracker:
         """Returns the world poses [..., 7] and velocities [..., 6] of objects that rest on a support with the poses
         ``relative`` [..., 7] in its frame.
 
-        None if the support does not exist.
+        None if the support does not exist. No object is beyond :data:`FARTHEST`: a chain of supports, each far from the
+        one below, does not lead out of the world.
         """
         frame = self.support_state(support)
         if frame is None:
             return None
         pose = frames.compose(frame[0], relative)
+        pose[..., :3] = np.clip(pose[..., :3], -FARTHEST, FARTHEST)
         velocity = np.broadcast_to(frame[1], (*pose.shape[:-1], 6)).copy()
         velocity[..., :3] += frames.cross(velocity[..., 3:], pose[..., :3] - frame[0][:3])
         return pose, velocity

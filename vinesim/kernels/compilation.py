@@ -126,10 +126,14 @@ def compile_kernels(packages: Sequence[str] = (), device: str = "cpu", *, then: 
 class CompiledModules:
     """The list of compiled modules in Warp's cache, for this version of the kernels.
 
-    For each compiled module, the cache contains a small file with the name of the module's folder.
+    For each compiled module, the cache contains a small file with the name of the module's folder and a digest of its
+    code. A module whose code has another digest is damaged. It is deleted, which one line tells, and counts as not
+    compiled.
     """
 
     def __init__(self) -> None:
+        self._intact: set[str] = set()
+        """Modules whose digest this object has compared."""
         self._cache = pathlib.Path(wp.config.kernel_cache_dir)
         h = hashlib.blake2b(wp.get_cpu_kernel_cache_key().encode(), digest_size=8)
         for name, source in _sources().items():
@@ -141,17 +145,32 @@ class CompiledModules:
         return [name for name in names if not self._is_there(name)]
 
     def _is_there(self, name: str) -> bool:
+        if name in self._intact:
+            return True
+        record = self._folder / name
         try:
-            return (self._cache / (self._folder / name).read_text()).is_dir()
-        except OSError:
+            module, _, digest = record.read_text().partition(" ")
+            folder = self._cache / module
+            if not folder.is_dir() or not digest:  # earlier releases wrote no digest
+                return False
+            if _digest(folder) == digest:
+                self._intact.add(name)
+                return True
+        except (OSError, UnicodeDecodeError):
             return False
+        log.warning("the compiled kernels in %s are damaged: compiling them again", folder)
+        with contextlib.suppress(OSError):
+            record.unlink()
+            if folder.parent == self._cache and folder.name.startswith("wp_"):  # the record may be damaged itself
+                shutil.rmtree(folder)
+        return False
 
     def add(self, name: str, folder: str) -> None:
         """Record that module ``name`` is compiled, in ``folder`` of Warp's cache."""
         with contextlib.suppress(OSError):  # without the record the module is compiled again at the next start
             self._folder.mkdir(exist_ok=True)
             draft = self._folder / f"{name}.{os.getpid()}.part"
-            draft.write_text(folder)
+            draft.write_text(f"{folder} {_digest(self._cache / folder)}")
             draft.replace(self._folder / name)
 
     def delete_leftovers(self) -> None:
@@ -160,6 +179,20 @@ class CompiledModules:
             with contextlib.suppress(OSError):
                 if time.time() - folder.stat().st_mtime > LEFTOVER_AGE:
                     shutil.rmtree(folder)
+
+
+def _digest(folder: pathlib.Path) -> str:
+    """Returns a digest of the code for the CPU in a folder of Warp's cache, and of whether its description can be
+    read."""
+    h = hashlib.blake2b(digest_size=16)
+    for file in sorted(folder.glob("*.o")):
+        h.update(file.read_bytes())
+    for file in sorted(folder.glob("*.meta")):
+        try:
+            json.loads(file.read_bytes())
+        except ValueError:
+            h.update(b"unreadable")
+    return h.hexdigest()
 
 
 class Compilers:

@@ -42,6 +42,13 @@ _GROUND_KINDS = int(mujoco.mjtGeom.mjGEOM_HFIELD)
 """Greatest of MuJoCo's types of geoms that are the ground: plane and height field."""
 _HIPS = BODY_PARTS.index("hips")
 
+MAX_CONTACTS = 3000
+"""Number of contacts of rigid bodies above which objects that are in each other pass through everything. GUESSED:
+MuJoCo's memory suffices for twice as many, and a crate of bunches has some hundred."""
+
+MAX_CONTACTS_OF_OBJECT = 100
+"""Number of contacts above which an object passes, if there are more than :data:`MAX_CONTACTS` in all. GUESSED."""
+
 MAX_RATE = 1e4
 """Rate [m/s, rad/s] of a degree of freedom above which the simulation counts as unstable."""
 
@@ -51,6 +58,9 @@ class RigidWorld(MujocoWorld):
 
     def __init__(self, model: Model, *, parameters: PhysicsParameters = PhysicsParameters()) -> None:
         super().__init__(model, parameters=parameters)
+        self.heaped = 0
+        """Number of times that a free object passed through everything for a step, because it was in a heap of objects
+        that overlap."""
         self.faults = 0
         """Number of times a kinematic tree was stopped because of a non-finite number or a rate above
         :data:`MAX_RATE`."""
@@ -209,6 +219,8 @@ class RigidWorld(MujocoWorld):
             self._soft_wires.place_geoms(m, d)
         # qfrc_applied still holds the forces of the last step, so a force on a sleeping box wakes it now
         mujoco.mj_step1(m, d)
+        if d.ncon > MAX_CONTACTS:
+            self._pass_through_heaps()
         if self._ground_contacts is not None:
             self._ground_contacts.apply(m, d)
         if self._passing_bunches:
@@ -224,6 +236,27 @@ class RigidWorld(MujocoWorld):
         d.qfrc_applied.fill(0.0)
         # the whole forward pass after the velocity stage, because calls of its parts omit dt K v
         mujoco.mj_forwardSkip(m, d, mujoco.mjtStage.mjSTAGE_VEL, 1)
+
+    def _pass_through_heaps(self) -> None:
+        """Let free objects with more than :data:`MAX_CONTACTS_OF_OBJECT` contacts pass through everything in this step.
+
+        So many contacts arise only if another client puts objects into each other. MuJoCo's memory would not suffice
+        for them.
+        """
+        m = self.mj_model
+        d = self.mj_data
+        contacts = np.bincount(m.geom_bodyid[d.contact.geom].ravel(), minlength=m.nbody)
+        objects = np.array([body for body, (_, kind) in self.owners.items() if kind in ("box", "bunch")], int)
+        crowded = objects[contacts[objects] > MAX_CONTACTS_OF_OBJECT]
+        geoms = np.isin(m.geom_bodyid, crowded)
+        kept = m.geom_contype[geoms].copy(), m.geom_conaffinity[geoms].copy()
+        bodies = m.body_contype[crowded].copy(), m.body_conaffinity[crowded].copy()
+        m.geom_contype[geoms] = m.geom_conaffinity[geoms] = 0
+        m.body_contype[crowded] = m.body_conaffinity[crowded] = 0
+        mujoco.mj_step1(m, d)
+        m.geom_contype[geoms], m.geom_conaffinity[geoms] = kept
+        m.body_contype[crowded], m.body_conaffinity[crowded] = bodies
+        self.heaped += len(crowded)
 
     def apply_controls(self) -> None:
         """Compute MuJoCo's controls from the targets of all robots."""

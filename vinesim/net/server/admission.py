@@ -26,6 +26,9 @@ before join again. Afterwards only a join reserves a name."""
 SEVERAL = "several"
 """Returned instead of a session if several sessions claim a name."""
 
+MAX_DEPARTED = 256
+"""Largest number of actors that have left and whose last records are still accepted."""
+
 MAX_TOKENS = 20_000
 """Largest number of liveliness tokens that the server notes."""
 
@@ -100,6 +103,8 @@ class AdmissionControl:
         self._pinned: set[str] = set()
         self._alive: dict[tuple[str, str], set[str]] = {}
         self._admitted: dict[tuple[str, str], _Admitted] = {}
+        self._departed: dict[tuple[str, str], str] = {}
+        """Session of each actor that was admitted, was no spectator and has left, in the order in which they left."""
         self._spectators: set[tuple[str, str]] = set()
         """World and name of each admitted spectator. Spectators may not publish records."""
         self.joined = 0
@@ -172,6 +177,7 @@ class AdmissionControl:
         if not sessions:
             self._alive.pop(actor, None)
         if self.holder(world, name) == session:
+            self._note_departure(actor, session)
             self._dismiss(actor)
         else:
             self._forget(world)
@@ -180,8 +186,17 @@ class AdmissionControl:
         """Note that a session has ended. Returns world and name of the actors that it held."""
         gone = [actor for actor, admitted in self._admitted.items() if admitted.session == session]
         for actor in gone:
+            self._note_departure(actor, session)
             self._dismiss(actor)
         return gone
+
+    def _note_departure(self, actor: tuple[str, str], session: str) -> None:
+        """Note that an admitted actor has left. The oldest of :data:`MAX_DEPARTED` is forgotten."""
+        self._departed.pop(actor, None)
+        if actor not in self._spectators:
+            self._departed[actor] = session
+        if len(self._departed) > MAX_DEPARTED:
+            del self._departed[next(iter(self._departed))]
 
     def expire(self, now: float) -> list[tuple[str, str]]:
         """Dismiss actors that were admitted and did not come within :data:`PROVISIONAL_TIMEOUT`. Returns them. ``now``
@@ -212,16 +227,26 @@ class AdmissionControl:
             self._forget(world)
         return gone
 
-    def may_publish(self, world: str, name: str, session: str) -> bool:
-        """Whether a session may publish records under a name: it was admitted with this name, and not as a spectator.
+    def publisher(self, world: str, name: str) -> str:
+        """Returns the session that may publish records under a name: it was admitted with this name, and not as a
+        spectator. Empty: none may.
 
         A server that was restarted has not admitted the actor yet. Until then the only live session with the name may
-        publish.
+        publish. A session that has left may, too, until another one has the name, because its last records may still be
+        on their way.
         """
         actor = (world, name)
         if actor in self._admitted:
-            return self._admitted[actor].session == session and actor not in self._spectators
-        return self._alive.get(actor) == {session}
+            return "" if actor in self._spectators else self._admitted[actor].session
+        alive = self._alive.get(actor, set())
+        if len(alive) == 1:
+            return "".join(alive)
+        return "" if alive else self._departed.get(actor, "")
+
+    def refuse(self, reason: str) -> Welcome:
+        """Count a join that is refused for a ``reason`` that this object does not know of, and return the reply."""
+        self.refused += 1
+        return Welcome(reason)
 
     def decide(self, world: str, name: str, session: str, greeting: bytes, now: float, address: str = "") -> Welcome:
         """Admit or reject an actor that sends the encoded hello ``greeting``, and return the reply to it.

@@ -32,6 +32,7 @@ from vinesim.net.server.sessions import SessionTable, fit_sessions
 from vinesim.net.transport import endpoints
 from vinesim.net.transport.access_control import SERVER, acl_config, server_answers_config, tls_config
 from vinesim.net.transport.bus import BusError
+from vinesim.net.transport.signatures import SealCheck
 from vinesim.net.transport.zenoh_bus import ROOT, WORLD
 from vinesim.net.transport.zenoh_session import close_session, config, open_session
 from vinesim.scene.triangles import is_digest
@@ -58,6 +59,9 @@ not report to it which of their clients are live: observed in 5 to 15 % of resta
 
 MAX_EMPTY_WORLDS = 64
 """Largest number of worlds without actors whose clocks are kept."""
+
+MAX_KNOWN_SESSIONS = 64
+"""Largest number of sessions whose public keys are kept. They are in every record and query."""
 
 MAX_WARNED = 1000
 """Largest number of keys whose first problem is logged."""
@@ -130,6 +134,7 @@ class Server:
                 "--real-time-factor to the one server that connects to no other"
             )
         self._certificates = certificates
+        self._seals = SealCheck(max_sessions=MAX_KNOWN_SESSIONS)
         self._linked = linked
         self._root = f"{ROOT}/{'*' if certificates is None else world}"
         """Key expression of all worlds. With certificates it names only one world, because access control denies
@@ -472,39 +477,58 @@ class Server:
         if sample.kind != zenoh.SampleKind.PUT or self.store is None:
             return
         key = _strip_root(sample.key_expr)
-        source = sample.source_info
         world, _, rest = key.partition("/")
         if not is_valid_name(world):
             self._count_malformed(key[:200], MessageError("the record belongs to no valid world"))
             return
         with self._lock:
-            is_own = source is not None and self._admission.may_publish(
-                world, rest.rpartition("/")[2], str(source.source_id.zid)
-            )
-        if not is_own:
+            publisher = self._admission.publisher(world, rest.rpartition("/")[2])
+        if len(sample.payload) > MAX_MESSAGE:
+            self._count_malformed(key, MessageError(f"the records are larger than {MAX_MESSAGE} B"))
+            return
+        payload = sample.payload.to_bytes()
+        if not self._is_from(publisher, sample, payload):
             self.foreign += 1
             self._warn_once(key, "dropped records of a session that did not join with this name, or of a spectator")
             return
-        payload = sample.payload.to_bytes() if len(sample.payload) <= MAX_MESSAGE else b""
         self.store.submit(key, payload)
+
+    def _is_from(self, session: str, message: zenoh.Sample | zenoh.Query, payload: bytes) -> bool:
+        """Whether a message or query comes from a ``session``: by its signature, or with certificates, where the router
+        checks the name in the key, by the session that it states.
+
+        Copies of old messages are accepted: a record that comes again has a claim that is not greater."""
+        if self._certificates is not None:
+            source = message.source_info
+            return source is not None and str(source.source_id.zid) == session
+        seal = message.attachment
+        sealed = None if seal is None else seal.to_bytes()
+        return self._seals.is_from(session, str(message.key_expr), payload, sealed, once=False)
 
     def _on_clock_query(self, query: zenoh.Query) -> None:
         with query:
             key = _strip_root(query.key_expr)
             world, _, name = key.split("/") if key.count("/") == 2 else ("*", "", "")
+            payload = _query_payload(query)
             try:
                 if not is_valid_name(world) or not is_valid_name(name):
                     raise MessageError("the query names no world, or no valid actor")
-                question = decode_time(_query_payload(query))
+                question = decode_time(payload)
             except MessageError as error:
                 self._count_malformed(key, error)
                 return
             self.pings += 1
+            report = question.report
+            if report is not None:
+                with self._lock:
+                    holder = self._admission.holder(world, name) if self._admission.may_slow(world, name) else ""
+                if not holder or not self._is_from(holder, query, payload):
+                    report = None
             with self._lock:
                 now = time.monotonic()
                 clock = self._clock(world)
-                if question.report is not None and self._admission.may_slow(world, name):
-                    clock.report(name, now, question.report)
+                if report is not None:
+                    clock.report(name, now, report)
                 world_time = clock.time(now)
                 factor = clock.factor
                 cause = clock.cause
@@ -517,12 +541,19 @@ class Server:
                 self._count_malformed(key, MessageError("an actor can only ask for itself"))
                 return
             world, _, name, session = key.split("/")
+            greeting = _query_payload(query)
+            is_signed = self._certificates is not None or self._is_from(session, query, greeting)
             with self._lock:
                 if (kept := self.store.scene_of(world)) is not None:
                     self._admission.pin_scene(world, kept)
-                welcome = self._admission.decide(
-                    world, name, session, _query_payload(query), time.monotonic(), self._address(session)
-                )
+                if is_signed:
+                    address = self._address(session)
+                    welcome = self._admission.decide(world, name, session, greeting, time.monotonic(), address)
+                else:
+                    welcome = self._admission.refuse(
+                        f"the greeting of {name[:60]!r} is not signed by the session that it names: use the same "
+                        "release of vinesim"
+                    )
                 if not welcome.refused:
                     self.store.open(world, self._admission.scene_of(world))
             if welcome.refused:
@@ -583,11 +614,11 @@ class Server:
                 with self._lock:
                     holder = self._admission.holder(world, name)
                     address = self._admission.address(world, name)
-                source = query.source_info
-                if not holder or source is None or str(source.source_id.zid) != holder:
+                payload = _query_payload(query)
+                if not holder or not self._is_from(holder, query, payload):
                     raise MessageError("only an actor that has joined can offer meshes")
                 group = address if address and not is_loopback(address) else f"{world}/{name}"
-                wanted = self.meshes.offer((world, name), decode_part(_query_payload(query)), group)
+                wanted = self.meshes.offer((world, name), decode_part(payload), group)
             except MessageError as error:
                 self._count_malformed(key, error)
                 return

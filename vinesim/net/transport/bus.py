@@ -30,6 +30,17 @@ MAX_STORED_BYTES = 64 << 20
 """Largest size of all payloads that wait for :meth:`Bus.poll` [B]."""
 
 
+SENDER_RATE = 400.0
+"""Rate of messages that one client accepts of one actor [1/s]. GUESSED: 60 poses, and 60 states of moving things in
+each of five cells, with what belongs to them."""
+
+SENDER_BURST = 1000.0
+"""Number of messages that one client accepts of one actor at once, after a silence."""
+
+MAX_SENDERS = 1024
+"""Number of senders at which those that have been silent are forgotten."""
+
+
 class BusError(RuntimeError):
     """The network cannot be used as requested. The text gives the cause, the place and what to do."""
 
@@ -170,6 +181,28 @@ class Bus(Protocol):
 
     def close(self) -> None:
         """Leave the world. Idempotent."""
+
+
+class SenderBudget:
+    """Budget of messages of each sender: whoever sends more has the rest dropped, before it costs time."""
+
+    def __init__(self) -> None:
+        self._left: dict[str, tuple[float, float]] = {}
+        """Number of messages that a sender may send at once, and when that number was valid [s], by name."""
+        self.dropped = 0
+        """Number of messages that were above the budget."""
+
+    def admits(self, name: str, now: float) -> bool:
+        """Whether a message of a sender is within its budget at ``now`` [s]. Counts it."""
+        left, since = self._left.get(name, (SENDER_BURST, now))
+        left = min(left + (now - since) * SENDER_RATE, SENDER_BURST)
+        if left < 1.0:
+            self.dropped += 1
+            return False
+        if len(self._left) >= MAX_SENDERS:
+            self._left = {one: kept for one, kept in self._left.items() if now - kept[1] < SENDER_BURST / SENDER_RATE}
+        self._left[name] = left - 1.0, now
+        return True
 
 
 @functools.lru_cache(maxsize=65536)

@@ -7,8 +7,7 @@ both tokens exist accepts neither session until one token is gone. If the server
 name, that one holds it in both cases (:meth:`NameHolders.prefer`), so a token alone takes no name away. Messages that
 arrive after their session has left are accepted, because the last records of an actor may still be on their way.
 
-Without TLS a session states its own identity. This separates programs that use vinesim or Zenoh as intended, but does
-not stop a program that was written to deceive (``docs/network.md``).
+Without TLS a message proves its session by a signature (:mod:`vinesim.net.transport.signatures`).
 """
 
 from __future__ import annotations

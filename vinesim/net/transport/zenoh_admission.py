@@ -46,10 +46,12 @@ class ServerAdmission:
         endpoint: str,
         is_secured: bool,
         submit: Callable[[Callable[[], object]], None],
+        seal: Callable[[str, bytes], bytes | None] = lambda _key, _payload: None,
     ) -> None:
         """``prefix``: first chunks of the world's keys, with a trailing slash. ``name``: name of the actor.
         ``endpoint``: text of the server's endpoint. ``is_secured``: whether certificates are used. ``submit(task)``
-        runs a function in the bus's own thread."""
+        runs a function in the bus's own thread. ``seal(key, payload)`` returns the seal of a query; None with
+        certificates."""
         self._session = session
         self._prefix = prefix
         self._patient_until = -math.inf
@@ -61,6 +63,7 @@ class ServerAdmission:
         self._endpoint = endpoint
         self._is_secured = is_secured
         self._submit = submit
+        self._seal = seal
         self.is_served = True
         """Whether the server of this world is present. Also true if there never was a server."""
         self.rejection = ""
@@ -223,7 +226,11 @@ class ServerAdmission:
         A reply that cannot be decoded is returned as a rejection.
         """
         replies = self._session.get(
-            self._key, payload=hello, timeout=CONNECT_TIMEOUT, consolidation=zenoh.ConsolidationMode.NONE
+            self._key,
+            payload=hello,
+            attachment=self._seal(self._key, hello),
+            timeout=CONNECT_TIMEOUT,
+            consolidation=zenoh.ConsolidationMode.NONE,
         )
         found = {
             str(reply.replier_id.zid): reply.ok.payload.to_bytes()

@@ -27,9 +27,10 @@ from vinesim.audio.hearing import SpectatorsSpeakTo
 from vinesim.core.errors import UsageError
 from vinesim.net.codec.header import MAX_MESSAGE, is_valid_name
 from vinesim.net.transport.access_control import tls_config
-from vinesim.net.transport.bus import KEEP_ALL, KEEP_LAST_1, NameTaken, Reply, SampleStore
+from vinesim.net.transport.bus import KEEP_ALL, KEEP_LAST_1, NameTaken, Reply, SampleStore, SenderBudget
 from vinesim.net.transport.endpoints import PORT, Endpoint, client_links
 from vinesim.net.transport.name_holders import NameHolders, bound_name
+from vinesim.net.transport.signatures import Identity, SealCheck, Sealer
 from vinesim.net.transport.zenoh_admission import ServerAdmission
 from vinesim.net.transport.zenoh_session import (
     CONNECT_TIMEOUT,
@@ -72,6 +73,10 @@ the server answers there [s]."""
 MAX_ASKED_NAMES = 8
 """Largest number of names that several sessions claim and for which the server is asked in one
 :data:`WATCH_PERIOD`."""
+
+SEALED_QUERIES = frozenset(("clock", "offer"))
+"""Queries that do something in the name of an actor, by the first chunk of their keys. The query to join is signed,
+too."""
 
 FETCH_TIMEOUT = 10.0
 """Time limit of :meth:`ZenohBus.fetch` [s], long enough for large replies over slow links."""
@@ -117,15 +122,24 @@ class ZenohBus:
             if not is_valid_name(text):
                 raise UsageError(f"{what} {text!r}: use 1 to 48 letters, digits, '_', '-' or '.'")
         links = client_links(connect, secured=certificates is not None)
+        self.is_secured = certificates is not None
+        """Whether certificates are used, so that the router checks all names."""
         self._credentials = {} if certificates is None else tls_config(certificates, name)
         self._certificate_watch = None if certificates is None else watch_certificates(certificates, name)
         self.name = name
         self.world = world
         self.endpoint = str(links.bulk)
         self.bytes_in = self.bytes_out = self._oversized = self.failures = self.foreign = 0
+        self.early = 0
+        """Number of messages that were dropped because their session had not shown its public key yet, as it does once
+        a second."""
+        self.seal_bytes_in = self.seal_bytes_out = 0
+        """Size of all seals that were received and sent [B], which :attr:`bytes_in` and :attr:`bytes_out` do not
+        contain."""
         self._put_count = self._put_bytes = self._sent_count = self._sent_bytes = 0
         self._prefix = f"{ROOT}/{world}/"
         self._store = SampleStore()
+        self._budget = SenderBudget()
         self._replies: collections.deque[tuple[str, bytes, float]] = collections.deque()
         self._names = NameHolders(frozenset((name,) if live else ()))
         self._lost_endpoints: set[str] = set()
@@ -147,7 +161,7 @@ class ZenohBus:
         self._unserved_since: float | None = None
         self._opener: threading.Thread | None = None
         """Thread that opens a session anew."""
-        self._opened: zenoh.Session | None = None
+        self._opened: tuple[zenoh.Session, Identity] | None = None
         """Session that was opened anew, until it replaces :attr:`_session`."""
         self.sessions_opened_anew = 0
         """Number of times that a session was opened anew because the server did not serve the old one."""
@@ -155,10 +169,13 @@ class ZenohBus:
         self._live = live
         self._queryables: list[Callable[[], object]] = []
         """Functions that declare the queryables on the present session."""
-        self._session = self._pose_session = open_client(links.bulk, self._credentials)
-        self.source = zenoh.SourceInfo(self._session.id, 0)
-        """Id of the session that holds the actor's name. All samples have this id, also those of the session of
-        poses."""
+        self.identity = Identity()
+        """Keys of the session that holds the actor's name. All samples have its signature, also those of the session of
+        poses. With certificates the router checks the names, and nothing is signed."""
+        self._seals = SealCheck()
+        self._session = self._pose_session = open_client(links.bulk, self._credentials, self.identity.session)
+        self.source = zenoh.SourceInfo(self._session.id, 0) if self.is_secured else None
+        """With certificates, the id of the session that holds the actor's name, which all samples state."""
         self._admission = ServerAdmission(
             self._session,
             self._prefix,
@@ -167,6 +184,7 @@ class ZenohBus:
             endpoint=self.endpoint,
             is_secured=certificates is not None,
             submit=self.submit,
+            seal=self.seal,
         )
         try:
             self._admission.find_server()
@@ -244,9 +262,9 @@ class ZenohBus:
         Another thread opens a session beside the present one. Only if the server answers there, it replaces the present
         one: if the server is gone from behind a router that works, nothing changes.
         """
-        if (session := self._opened) is not None:
+        if (opened := self._opened) is not None:
             self._opened = None
-            self._replace_session(session)
+            self._replace_session(*opened)
         now = time.monotonic()
         if self._admission.is_served or self.endpoint in self._lost_endpoints:
             self._unserved_since = None
@@ -260,22 +278,24 @@ class ZenohBus:
 
     def _try_anew(self) -> None:
         """Body of the thread that opens a session beside the present one, and keeps it if the server answers there."""
+        identity = Identity()
         try:
-            session = open_client(self._bulk_endpoint, self._credentials)
+            session = open_client(self._bulk_endpoint, self._credentials, identity.session)
         except ServerUnreachable as error:
             log.warning("%s: %s", self.name, error)
             return
         if self._admission.answers(session):
-            self._opened = session
+            self._opened = session, identity
         else:
             close_session(session)
 
-    def _replace_session(self, session: zenoh.Session) -> None:
+    def _replace_session(self, session: zenoh.Session, identity: Identity) -> None:
         """Use another session in the place of the present one, with all that was declared."""
         log.warning("%s: the server at %s did not serve this session: opened a new one", self.name, self.endpoint)
         abandoned, self._session = self._session, session
+        self.identity = identity
         self.sessions_opened_anew += 1
-        self.source = zenoh.SourceInfo(session.id, 0)
+        self.source = zenoh.SourceInfo(session.id, 0) if self.is_secured else None
         self._lost_endpoints.discard(self.endpoint)
         close_session(abandoned)  # which withdraws its token, so that the name is free
         self._declared = [self._watch_connection(session, self.endpoint)]
@@ -419,14 +439,32 @@ class ZenohBus:
         """Note that a liveliness token was declared or withdrawn."""
         self._names.update(*_token(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
-    def _is_foreign(self, key: str, source: zenoh.EntityGlobalId | None) -> bool:
+    def seal(self, key: str, payload: bytes) -> bytes | None:
+        """Returns the seal of a message or query under a whole ``key``; None with certificates."""
+        return None if self.is_secured else self.identity.seal(key, payload)
+
+    def _is_foreign(
+        self, key: str, payload: bytes, source: zenoh.EntityGlobalId | None, seal: zenoh.ZBytes | None, *, once: bool
+    ) -> bool:
         """Whether a message comes from another session than the one that holds the name in its key. Counts such
         messages.
 
-        ``source``: session that sent the message; None: unknown, which counts as foreign.
+        ``source``: session that the message states; with certificates it counts, because the router checks the name.
+        ``seal``: what the message carries beside its payload. ``once``: whether messages under the key have an order.
         """
         name = bound_name(key)
-        if not name or (source is not None and str(source.zid) == self._names.holder(name)):
+        if not name:
+            return False
+        holder = self._names.holder(name)
+        if self.is_secured:
+            is_own = source is not None and str(source.zid) == holder
+        else:
+            sealed = None if seal is None else seal.to_bytes()
+            if self._seals.is_early(holder, sealed):
+                self.early += 1
+                return True
+            is_own = self._seals.is_from(holder, self._prefix + key, payload, sealed, once=once)
+        if is_own:
             return False
         self.foreign += 1
         if self.foreign == 1:
@@ -442,7 +480,7 @@ class ZenohBus:
 
     @property
     def dropped(self) -> int:
-        return self._store.overflowed + self._oversized
+        return self._store.overflowed + self._oversized + self._budget.dropped
 
     @property
     def status_message(self) -> str:
@@ -476,7 +514,7 @@ class ZenohBus:
                 allowed_destination=zenoh.Locality.REMOTE,
             )
 
-        return BusPublisher(self, declare, reliable)
+        return BusPublisher(self, declare, self._prefix + key, reliable)
 
     def subscribe(self, pattern: str, depth: int = KEEP_LAST_1) -> BusSubscription:
         skip = len(self._prefix)
@@ -484,12 +522,20 @@ class ZenohBus:
         def store(sample: zenoh.Sample) -> None:
             size = len(sample.payload)
             source = sample.source_info
+            seal = sample.attachment
             key = str(sample.key_expr)[skip:]
-            self.bytes_in += size
             if size > MAX_MESSAGE:
                 self._oversized += 1
-            elif not self._is_foreign(key, source.source_id if source is not None else None):
-                self._store.put(depth, key, sample.payload.to_bytes())
+            elif self.is_secured and not self._budget.admits(bound_name(key), time.monotonic()):
+                pass  # counted by the budget; the router has checked the name
+            else:
+                payload = sample.payload.to_bytes()
+                if self._is_foreign(key, payload, None if source is None else source.source_id, seal, once=True):
+                    pass
+                elif self.is_secured or self._budget.admits(bound_name(key), time.monotonic()):
+                    self._store.put(depth, key, payload)
+            self.bytes_in += size
+            self.seal_bytes_in += 0 if seal is None else len(seal)
 
         def declare(session: zenoh.Session) -> zenoh.Subscriber:
             return session.declare_subscriber(
@@ -508,15 +554,16 @@ class ZenohBus:
             if reply.ok is not None and len(reply.ok.payload) <= MAX_MESSAGE:
                 arrived = time.monotonic()
                 reply_key = str(reply.ok.key_expr)[skip:]
+                payload = reply.ok.payload.to_bytes()
                 if bound_name(reply_key):
-                    is_foreign = self._is_foreign(reply_key, reply.replier_id)
+                    is_foreign = self._is_foreign(reply_key, payload, reply.replier_id, reply.ok.attachment, once=False)
                 else:
                     is_foreign = not self._admission.is_server(reply.replier_id)
                     self.foreign += is_foreign
                 if len(self._replies) >= MAX_PENDING_REPLIES:
                     self._oversized += 1
                 elif not is_foreign:
-                    self._replies.append((reply_key, reply.ok.payload.to_bytes(), arrived))
+                    self._replies.append((reply_key, payload, arrived))
 
         # by default Zenoh keeps one reply for each key, but a snapshot has several
         no_consolidation = zenoh.ConsolidationMode.NONE
@@ -525,10 +572,15 @@ class ZenohBus:
                 self._prefix + key,
                 called_directly(on_reply),
                 payload=payload,
+                attachment=self._seal_of_query(key, payload),
                 timeout=CONNECT_TIMEOUT,
                 consolidation=no_consolidation,
             )
         )
+
+    def _seal_of_query(self, key: str, payload: bytes) -> bytes | None:
+        """Returns the seal of a query that asks for something in the actor's name; None for other queries."""
+        return self.seal(self._prefix + key, payload) if key.partition("/")[0] in SEALED_QUERIES else None
 
     def replies(self) -> list[Reply]:
         now = time.monotonic()
@@ -543,6 +595,7 @@ class ZenohBus:
             replies = self._session.get(
                 self._prefix + key,
                 payload=payload,
+                attachment=self._seal_of_query(key, payload),
                 source_info=self.source,
                 timeout=FETCH_TIMEOUT,
                 priority=zenoh.Priority.BACKGROUND,
@@ -567,7 +620,9 @@ class ZenohBus:
             with query:
                 request = query.payload
                 try:
-                    query.reply(str(query.key_expr), respond(request.to_bytes() if request is not None else b""))
+                    answer = respond(request.to_bytes() if request is not None else b"")
+                    key = str(query.key_expr)
+                    query.reply(key, answer, attachment=self.seal(key, answer))
                 except zenoh.ZError as error:
                     self.count_failure(error)
 
@@ -651,7 +706,8 @@ class ZenohBus:
             self._admission.close()
             for declared in reversed(getattr(self, "_declared", [])):
                 _undeclare(declared)
-        for session in (self._probed, self._opened, self._pose_session, self._session):
+        opened = None if self._opened is None else self._opened[0]
+        for session in (self._probed, opened, self._pose_session, self._session):
             if session is not None:
                 close_session(session)
 
@@ -680,9 +736,14 @@ class BusPublisher:
     Failures of the network are counted and never raised.
     """
 
-    def __init__(self, bus: ZenohBus, declare: Callable[[zenoh.Session], zenoh.Publisher], reliable: bool) -> None:
+    def __init__(
+        self, bus: ZenohBus, declare: Callable[[zenoh.Session], zenoh.Publisher], key: str, reliable: bool
+    ) -> None:
+        """``key``: whole key of the messages."""
         self._bus = bus
         self._declare = declare
+        self._key = key
+        self._sealer = Sealer(key)
         self._reliable = reliable
         self._publisher: zenoh.Publisher | None = None
         self._is_closed = self._is_renewing = False
@@ -708,17 +769,29 @@ class BusPublisher:
         publisher = self._publisher
         if publisher is None or not self.matching:
             return False
+        bus = self._bus
         if self._reliable:
-            if not self._bus.submit_put(lambda: publisher.put(payload, source_info=self._bus.source), len(payload)):
+            if not bus.submit_put(lambda: self._put_reliably(payload), len(payload)):
                 return False
         else:
+            seal = None if bus.is_secured else self._sealer.seal(bus.identity, payload)
             try:
-                publisher.put(payload, source_info=self._bus.source)
+                publisher.put(payload, source_info=bus.source, attachment=seal)
             except zenoh.ZError as error:
                 self._fail(error)
                 return False
-        self._bus.bytes_out += len(payload)
+            bus.seal_bytes_out += 0 if seal is None else len(seal)
+        bus.bytes_out += len(payload)
         return True
+
+    def _put_reliably(self, payload: bytes) -> None:
+        """Sign and send a reliable message. The bus's own thread calls this, so that the message has the signature of
+        the session that sends it."""
+        if (publisher := self._publisher) is not None:
+            bus = self._bus
+            seal = bus.seal(self._key, payload)
+            bus.seal_bytes_out += 0 if seal is None else len(seal)
+            publisher.put(payload, source_info=bus.source, attachment=seal)
 
     def move_to(self, session: zenoh.Session) -> None:
         """Declare the publisher on another session instead of the present one."""

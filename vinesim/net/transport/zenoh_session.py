@@ -135,12 +135,14 @@ def _close_all() -> None:
         time.sleep(0.005)
 
 
-def open_client(endpoint: Endpoint, credentials: dict[str, Any]) -> zenoh.Session:
+def open_client(endpoint: Endpoint, credentials: dict[str, Any], session_id: str = "") -> zenoh.Session:
     """Open a client session to a router at an endpoint. Raises :class:`ServerUnreachable` if no router answers,
     :class:`SessionRefused` if a program is there that opens no session.
 
-    ``credentials``: Zenoh's TLS settings; empty without certificates.
+    ``credentials``: Zenoh's TLS settings; empty without certificates. ``session_id``: id of the session, see
+    :mod:`vinesim.net.transport.signatures`; empty: Zenoh chooses one.
     """
+    named = {"id": session_id} if session_id else {}
     settings = config(
         "client",
         connect__endpoints=[endpoint.locator],
@@ -148,6 +150,7 @@ def open_client(endpoint: Endpoint, credentials: dict[str, Any]) -> zenoh.Sessio
         connect__exit_on_failure=True,
         connect__retry={"period_init_ms": 100, "period_max_ms": 400, "period_increase_factor": 2},
         **credentials,
+        **named,
     )
     try:
         return open_session(settings)
