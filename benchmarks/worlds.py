@@ -65,7 +65,7 @@ def plants(canes: int, *, touched: bool) -> Model:
     if touched:
         start = np.array([(BAR[0], -1.0, BAR[1])], np.float32)
         radius = np.full((1, 2), BAR_RADIUS, np.float32)
-        fixed = {"fixed_start": start, "fixed_end": start * np.float32([1, -1, 1]), "fixed_radius": radius}
+        fixed = {"fixed_start": start, "fixed_end": (start * [1, -1, 1]).astype(np.float32), "fixed_radius": radius}
     return assemble([cane(number) for number in range(canes)], **fixed)
 
 

@@ -82,9 +82,8 @@ class ReachEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         variants = [_variant(vines_seed, i) for i in range(min(num_envs, VARIANTS))]
         self.worlds = Worlds(plants_of_worlds(variants, num_envs), num_envs, robots=[arm(BASE, HOME)], device=device)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (len(AXES),), np.float32)
-        self.single_observation_space = gymnasium.spaces.Box(
-            -np.inf, np.inf, (2 * len(AXES) + 3 * SHOOTS + 1 + SHOOTS,), np.float32
-        )
+        self._numbers = 2 * len(AXES) + 3 * SHOOTS + 1 + SHOOTS
+        self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (self._numbers,), np.float32)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._device = device
@@ -107,7 +106,7 @@ class ReachEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
         self._target = empty(wp.int32, self.num_envs)
         self._action = empty(float, self.num_envs, joints)
-        self._observation = empty(float, self.num_envs, self.single_observation_space.shape[0])
+        self._observation = empty(float, self.num_envs, self._numbers)
         self._reward = empty(float, self.num_envs)
         self._success = empty(wp.bool, self.num_envs)
         limit = np.full(joints, JOINT_LIMIT)

@@ -225,8 +225,8 @@ def _ridges(view: _View) -> np.ndarray:
         right = np.sin(angle)
         down = -np.cos(angle)
         line = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
-        ends = [(round(half + sign * half * right), round(half + sign * half * down)) for sign in (-1.0, 1.0)]
-        cv2.line(line, *ends, 1.0)
+        start, end = ((round(half + sign * half * right), round(half + sign * half * down)) for sign in (-1.0, 1.0))
+        cv2.line(line, start, end, (1.0,))
         line /= line.sum()
         mean = cv2.filter2D(view.lab, -1, line, borderType=cv2.BORDER_REPLICATE)
         off = []
@@ -249,7 +249,7 @@ def _old_wood(is_row: np.ndarray) -> np.ndarray:
     _, areas, statistics, _ = cv2.connectedComponentsWithStats(core)
     is_large = statistics[:, cv2.CC_STAT_AREA] * CELL**2 > THICK_AREA
     is_large[0] = False
-    return is_large[areas]
+    return is_large[areas.astype(int)]
 
 
 def _lines(ridges: np.ndarray) -> list[np.ndarray]:

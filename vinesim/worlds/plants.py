@@ -43,7 +43,7 @@ def _joined(models: Sequence[Model]) -> Model:
     for model in models:
         added = model.counts()
         for name, dim in Model.array_fields().items():
-            kind = dim.shape[0]
+            kind = str(dim.shape[0])
             if kind in _STANDING:
                 continue
             value = getattr(model, name)
@@ -75,7 +75,7 @@ def _gathered(pool: Model, trees: np.ndarray) -> Model:
     sizes = {kind: len(rows[kind]) for kind in rows}
     gathered = Model.allocate(**(pool.counts() | sizes))
     for name, dim in Model.array_fields().items():
-        kind = dim.shape[0]
+        kind = str(dim.shape[0])
         if kind not in _STANDING:
             getattr(gathered, name)[:] = getattr(pool, name)[rows[kind]]
     gathered.tree_first[:] = first

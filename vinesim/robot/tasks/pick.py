@@ -113,6 +113,8 @@ class PickBunch(Task):
     """Moves one bunch from its vine into a box. ``picked`` and ``reason`` hold the result."""
 
     key_phases = frozenset({"cut", "back"})
+    grasp_force = GRASP_FORCE
+    """[N] Force of each finger."""
 
     def __init__(self, physics: Physics, robot: Robot, plan: PickPlan, *, timeout: float = 90.0) -> None:
         """``robot``: must have its cutters (:meth:`Robot.fit_cutters`). ``timeout`` [s]: time after which the task
@@ -237,7 +239,7 @@ class PickBunch(Task):
             raise TaskFailed(self._describe_bunch())
 
     def _close_gripper(self, ahead: np.ndarray) -> Iterator[str]:
-        """Close the fingers with :data:`GRASP_FORCE` until all of them feel the bunch."""
+        """Close the fingers with :attr:`grasp_force` until all of them feel the bunch."""
         rigid = self.robot.rigid
         name = self.robot.name
         stiffness = np.array([self.robot.description.drives[i].stiffness for i in self._fingers])
@@ -252,7 +254,7 @@ class PickBunch(Task):
                 raise TaskFailed(
                     f"the fingers feel {felt.min():.0f} N at an opening of {here.sum():.3f} m: nothing to hold"
                 )
-            self.robot.command_position(here - GRASP_FORCE / stiffness, self._fingers)
+            self.robot.command_position(here - self.grasp_force / stiffness, self._fingers)
             yield "close"
 
     def _cut(self) -> Iterator[str]:
