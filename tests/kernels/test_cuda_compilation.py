@@ -41,12 +41,12 @@ MODULES = sorted(
 
 def test_the_modules_that_read_heights_are_known() -> None:
     assert {"raster.ray_cast", "raster.camera_raster", "lidar.lidar_raster", "shading.deferred"} <= set(MODULES)
-    assert "contact.tree_narrowphase" in MODULES
+    assert "worlds.narrowphase" in MODULES
     assert "plants.integration" not in MODULES
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", [*MODULES, "contact.tree_islands"])
+@pytest.mark.parametrize("name", [*MODULES, "worlds.contact_step"])
 def test_a_module_compiles_for_cuda(name: str, tmp_path: pathlib.Path) -> None:
     module = importlib.import_module(f"vinesim.kernels.{name}")
     (file,) = wp.compile_aot_module(module, arch=ARCHITECTURE, module_dir=tmp_path, use_ptx=True)

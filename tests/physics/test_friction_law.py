@@ -12,7 +12,6 @@ import warp as wp
 from tests.physics.test_batch_contacts import canes, moving
 from tests.physics.test_delassus import assembled
 from vinesim.core.warp_arrays import SharedArrays, share, zeros
-from vinesim.kernels.contact import tree_islands
 from vinesim.kernels.contact.friction_law import (
     Steps,
     Surface,
@@ -20,6 +19,7 @@ from vinesim.kernels.contact.friction_law import (
     project_into_cone,
     steps_of,
 )
+from vinesim.kernels.worlds import contact_step
 from vinesim.kernels.worlds.dense_solver import WorldSearch, WorldSystem, solve_tree, update_velocities
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.world import Physics
@@ -150,6 +150,6 @@ def test_sliding_is_linearised_by_the_derivative_of_the_projection() -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="needs the CUDA compiler in Warp's wheel for Linux")
 def test_batches_compile_for_a_gpu(tmp_path: pathlib.Path) -> None:
     """Without a GPU nothing else compiles what a CPU leaves out: the exchange of numbers between threads of a warp."""
-    wp.compile_aot_module(tree_islands, device=None, arch=80, module_dir=tmp_path, use_ptx=True)
+    wp.compile_aot_module(contact_step, device=None, arch=80, module_dir=tmp_path, use_ptx=True)
     (compiled,) = tmp_path.glob("*.ptx")
     assert "shfl.sync" in compiled.read_text()
