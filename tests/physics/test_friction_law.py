@@ -20,7 +20,7 @@ from vinesim.kernels.contact.friction_law import (
     steps_of,
 )
 from vinesim.kernels.worlds import contact_step
-from vinesim.kernels.worlds.dense_solver import WorldSearch, WorldSystem, solve_tree, update_velocities
+from vinesim.kernels.worlds.dense_solver import WorldSearch, WorldSystem, solve_world, update_velocities
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.world import Physics
 
@@ -35,7 +35,7 @@ NEWTON_STEPS = wp.constant(6)
 @wp.kernel
 def solve_one_tree(count: int, tolerance: wp.float64, system: WorldSystem, search: WorldSearch):
     update_velocities(0, 1, 3 * count, system)
-    _sweeps, _busy = solve_tree(0, 0, 1, count, MOST_SWEEPS, NEWTON_STEPS, tolerance, system, search)
+    _sweeps, _busy = solve_world(0, 0, 1, count, MOST_SWEEPS, NEWTON_STEPS, tolerance, system, search)
 
 
 def solve_as_in_a_batch(matrix: np.ndarray, free: np.ndarray, surface: np.ndarray) -> np.ndarray:
