@@ -134,12 +134,13 @@ def test_a_world_that_can_be_written_again_is_not_lost(tmp_path):
     assert len(Journal.load(tmp_path / "first.facts").state) == 1
 
 
-def test_a_robot_of_2000_links_is_not_admitted():
+def test_a_description_in_a_greeting_is_not_admitted():
+    """Clients ask for it by its digest, and check it, only when they are near the robot."""
     links = "".join(f'<link name="l{number}"/>' for number in range(2000))
     with Server("tcp/127.0.0.1:0") as server, stranger(server.endpoint) as session:
         welcome = ask_to_join(session, "w", "mallory", urdf=f"<robot name='x'>{links}</robot>")
-        assert "2000 links, at most 512" in welcome.refused
-        assert not ask_to_join(session, "w", "mallory", urdf="<robot name='x'><link name='a'/></robot>").refused
+        assert "with a URDF: only the reply to a query has it" in welcome.refused
+        assert not ask_to_join(session, "w", "mallory").refused
 
 
 def offer(session: zenoh.Session, world: str, name: str, payload: bytes) -> MeshWanted | None:

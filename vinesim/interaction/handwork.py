@@ -220,7 +220,7 @@ class Handwork:
         """Let an actor work on the wood nearest to ``point`` [3] m: ``what`` is one of :data:`PLANT_WORK`. Call this
         between steps. Returns what was done, as a sentence without the actor.
 
-        ``tie``: tie the cane to the nearest wire; ``untie``: open the nearest tie; ``take_leaves``: take the leaves off
+        "tie" ties the cane to the nearest wire, "untie" opens the nearest tie, "take_leaves" takes the leaves off
         the segment. Raises :class:`ValueError` if there is nothing of this kind within :data:`TOOL_REACH`.
         """
         if what not in PLANT_WORK:

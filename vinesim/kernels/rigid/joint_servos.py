@@ -189,7 +189,8 @@ def apply_controls(
             qvel[drives.v[i]],
         )
         control_out[i] = control
-        ctrl_out[drives.actuator[i]] = control
+        actuator = drives.actuator[i]
+        ctrl_out[actuator] = control
     if base.actuator.shape[0] == 0:
         return
     commanded = wp.vec3d(base.velocity[0], base.velocity[1], base.velocity[2])
@@ -206,4 +207,5 @@ def apply_controls(
             base_target_out[i],
         )
         base_target_out[i] = target
-        ctrl_out[base.actuator[i]] = control
+        actuator = base.actuator[i]
+        ctrl_out[actuator] = control

@@ -38,7 +38,8 @@ def apply_controls(
     """
     world = wp.tid()
     for i in range(actuator.shape[0]):
-        ctrl_out[world, actuator[i]] = joint_control(
+        servo = actuator[i]
+        ctrl_out[world, servo] = joint_control(
             stiffness[i],
             damping_at_start[i],
             damping_at_end[i],
@@ -61,4 +62,5 @@ def apply_controls(
             base_targets_out[world, i],
         )
         base_targets_out[world, i] = target
-        ctrl_out[world, base_actuator[i]] = control
+        servo = base_actuator[i]
+        ctrl_out[world, servo] = control
