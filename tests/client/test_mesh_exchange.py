@@ -140,7 +140,7 @@ def test_a_robot_is_seen_and_felt_where_its_files_do_not_exist(tmp_path, empty_c
     """One client has the package, the other none: first boxes, then the same triangles in its pictures and contacts."""
     description = package(tmp_path / "workspace")
     scene = load_scene("demo")
-    far = frames.pose([60.0, 60.0, 0.0])
+    far = frames.pose([12.0, 12.0, 0.0])
     with HeldBus("anna", server.endpoint) as hers, ZenohBus("bert", connect=server.endpoint) as his:
         anna = Client(scene, model(), description, hers, name="anna", pose=frames.pose(np.zeros(3)))
         bert = Client(scene, model(), None, his, name="bert", pose=far)
@@ -178,7 +178,7 @@ def test_a_mesh_that_is_in_the_cache_is_not_sent_again(tmp_path, empty_cache, se
         anna = Client(scene, model(), description, hers, name="anna", pose=frames.pose(np.zeros(3)))
         for name in ("bert", "carl"):
             with ZenohBus(name, connect=server.endpoint) as bus:
-                client = Client(scene, model(), None, bus, name=name, pose=frames.pose([60.0, 60.0, 0.0]))
+                client = Client(scene, model(), None, bus, name=name, pose=frames.pose([12.0, 12.0, 0.0]))
                 until(
                     lambda client=client: "anna" in client.remote_actors and seen(client, "anna") == seen(anna, "anna"),
                     "the mesh",
