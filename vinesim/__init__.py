@@ -111,6 +111,7 @@ _MODULES = {
 """Module of each public name, relative to the package ``vinesim``."""
 
 __all__ = [
+    "Binding",
     "Blade",
     "Box",
     "Camera",

@@ -284,6 +284,7 @@ def test_a_step_is_a_list_of_stages_and_trees_fall_asleep():
         "wind",
         "grasps",
         "blades",
+        "handwork",
         "rigid",
         "contacts",
         "detail",

@@ -223,6 +223,8 @@ def with_bar(model: Model, place: np.ndarray, organ: Organ, radius: float) -> Mo
     model.fixed_index = np.array([3], np.int32)
     model.fixed_tension = np.zeros(1, np.float32)
     model.fixed_shear_modulus = np.zeros(1, np.float32)
+    model.fixed_stretch = np.zeros(1, np.float32)
+    model.fixed_strength = np.zeros(1, np.float32)
     return model
 
 
