@@ -1,5 +1,7 @@
 """The task reach as a Gymnasium vector environment."""
 
+import pathlib
+import re
 import warnings
 from typing import Any
 
@@ -94,6 +96,15 @@ def test_gymnasium_finds_no_fault_in_one_world():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the checker advises against observations without bounds
         check_env(gymnasium.make("vinesim/Reach-v0").unwrapped, skip_render_check=True)
+
+
+def test_the_examples_of_the_page_run():
+    """The blocks of docs/worlds.md."""
+    page = (pathlib.Path(__file__).parents[2] / "docs" / "worlds.md").read_text()
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert len(blocks) == 2
+    for block in blocks:
+        exec(block, {})
 
 
 def test_bad_arguments_are_named():
