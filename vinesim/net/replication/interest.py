@@ -51,16 +51,16 @@ so that two actors at the same distance do not change places all the time."""
 POSE_RATE = 60.0
 """Number of poses that an actor publishes a second, each on one of the :data:`POSE_LAYERS`."""
 
-REGION_BUDGET = 120.0
+REGION_BUDGET = 110.0
 """Largest number of poses a second that an actor shall receive from its window of regions, without the faster layers.
 
 If more actors share a window, each of them publishes more rarely. GUESSED, such that an actor in any crowd receives at
-most 60 kB/s: 120 poses of its window, 200 of the faster layers, and 50 coarse poses, of at most 162 B each."""
+most 60 kB/s: 110 poses of its window, 200 of the faster layers, and 50 coarse poses, of at most 162 B each."""
 
 FAR_KEY = "a/{actor}/far"
 """Key of an actor's coarse poses, which have no joints, for all actors."""
 
-FAR_EVERY = 120
+FAR_EVERY = 110
 """Divisor of the pose rate: every ``FAR_EVERY``-th pose is also published as a coarse pose, 0.5 a second."""
 
 FAR_BUDGET = 50.0
