@@ -60,7 +60,7 @@ most 60 kB/s: 110 poses of its window, 200 of the faster layers, and 50 coarse p
 FAR_KEY = "a/{actor}/far"
 """Key of an actor's coarse poses, which have no joints, for all actors."""
 
-FAR_EVERY = 110
+FAR_EVERY = 120
 """Divisor of the pose rate: every ``FAR_EVERY``-th pose is also published as a coarse pose, 0.5 a second."""
 
 FAR_BUDGET = 50.0
