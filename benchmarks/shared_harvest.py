@@ -34,7 +34,7 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spare_bodies import PLACE_STEP
-from vinesim.scene.spec import load_scene
+from vinesim.scene.spec import Scene, load_scene
 from vinesim.scene.values import Measurement
 
 DT = 0.01
@@ -232,11 +232,12 @@ class SharedVine:
         return True
 
 
-def replayed(vine: SharedVine, file: pathlib.Path) -> tuple[str, str]:
-    """Returns the digests of a client that watches a recording: of its run, and of what has changed for good."""
+def replayed(scene: Scene, model: Model, file: pathlib.Path) -> tuple[str, str]:
+    """Let a spectator replay a recording. Returns the digest of all its states, and that of the lasting changes to
+    plants in its last state (:func:`lasting_digest`)."""
     bus = ReplayBus(read_recording(file), "viewer")
     pose = frames.pose([0.5, -2.0, 1.6], frames.IDENTITY)
-    client = Spectator(vine.scene, vine.model, None, bus, name="viewer", pose=pose, clock=lambda: bus.time)
+    client = Spectator(scene, model, None, bus, name="viewer", pose=pose, clock=lambda: bus.time)
     client.physics.wind = None
     digest = StateDigest()
     while not bus.ended:
@@ -292,7 +293,7 @@ def shared_harvest(
         yield Measurement("shared_harvest", f"{case}: largest distance of bodies of plants", 1e3 * apart, "mm")
         yield Measurement("shared_harvest", f"{case}: recording", 1e-6 * file.stat().st_size, "MB")
         if replays:
-            digests = [replayed(vine, file) for _ in range(replays)]
+            digests = [replayed(vine.scene, vine.model, file) for _ in range(replays)]
             lasting = lasting_digest(clients[0].physics)
             yield Measurement(
                 "shared_harvest", f"{case}: different runs of replays", len({d for d, _ in digests}), "runs"

@@ -101,7 +101,7 @@ def soak(
 ) -> Iterator[Measurement]:
     """Run for ``minutes`` [min] and measure. ``announce`` is called with a line of text from time to time.
 
-    ``record``: file of the figures so far, as lines of JSON. It is written anew every :data:`RECORD_PERIOD`.
+    ``record``: file of the figures so far, as lines of JSON. The soak replaces the file every :data:`RECORD_PERIOD`.
     """
 
     def write(result: SoakResult) -> None:

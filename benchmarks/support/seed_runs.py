@@ -31,7 +31,7 @@ class SeedRuns:
     case: Line
     """Options of the benchmark that each line names: a line with other values is of another run."""
     summary: Callable[[Line], str]
-    """Returns what is told of a line when it is known."""
+    """Returns the text that announces a line when its seed has ended."""
     announce: Callable[[str], None]
     record: pathlib.Path | None = None
     """File of the lines. Seeds that it has are not run again."""

@@ -8,40 +8,26 @@ import pathlib
 import time
 from types import SimpleNamespace
 
-import msgspec
 import numpy as np
 import pytest
 
+from benchmarks.shared_harvest import replayed, small_vineyard
 from tests.support.live_server import ServerProcess
 from tests.support.long_rows import long
 from tests.support.shared_vineyard import DT, World
 from vinesim.client.client import Client
 from vinesim.client.recording.recorder import Recorder
-from vinesim.client.recording.replay import ReplayBus
-from vinesim.client.recording.state_digest import StateDigest, lasting_digest, lasting_parts
-from vinesim.client.spectator import Spectator
+from vinesim.client.recording.state_digest import lasting_digest, lasting_parts
 from vinesim.core import frames
 from vinesim.net.codec.control import decode_time, encode_time
-from vinesim.net.recording.mcap_reader import read_recording
 from vinesim.net.recording.mcap_writer import RecordingWriter
 from vinesim.net.transport.zenoh_bus import ZenohBus
 from vinesim.scene import spec as scenes
-from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spare_bodies import PLACE_STEP
 
 pytestmark = pytest.mark.slow
-
-
-def small(name: str) -> Model:
-    """One vine of a scene, all of whose canes can break."""
-    scene = scenes.load_scene(name)
-    model = generate(msgspec.structs.replace(scene, layout=msgspec.structs.replace(scene.layout, rows=1, vines=1)))
-    endless = (model.body_organ == int(Organ.CANE)) & (model.body_strength == 0.0)  # canes of dormant scenes
-    model.body_strength[endless] = 60e6
-    model.body_yield_strength[endless] = 45e6
-    return model
 
 
 @dataclasses.dataclass
@@ -151,7 +137,7 @@ def differing(one: Client, other: Client) -> list[str]:
 
 @pytest.mark.parametrize("scene", ["winter_spur", *long("vsp")])
 def test_two_clients_and_a_late_one_agree_by_hash_and_a_replay_to_the_bit(scene: str, tmp_path: pathlib.Path):
-    world = World(small(scene))
+    world = World(small_vineyard(scene))
     world.server.bus.declare_queryable("clock/*", lambda asked: encode_time(decode_time(asked)[0], 1000.0 + world.now))
     ada, bob = (Worker(world.join(name, x, -2.0)) for name, x in (("ada", 0.5), ("bob", 1.5)))
     file = tmp_path / "work.mcap"
@@ -188,7 +174,7 @@ def test_two_clients_and_a_late_one_agree_by_hash_and_a_replay_to_the_bit(scene:
         assert np.abs(apart).max() < 5e-3
     assert len({lasting_digest(client.physics) for client in clients}) == 1
     recording.close()
-    digests = {replayed(world, file) for _ in range(2)}
+    digests = {replayed(world.scene, world.model, file) for _ in range(2)}
     assert len(digests) == 1
     assert {lasting for _, lasting in digests} == {lasting_digest(ada.physics)}
 
@@ -218,7 +204,7 @@ class ZenohWorld(World):
 @pytest.mark.long
 def test_clients_over_zenoh_agree_by_hash():
     with ServerProcess("tcp/127.0.0.1:0") as server:
-        world = ZenohWorld(small("winter_spur"), server.endpoint)
+        world = ZenohWorld(small_vineyard("winter_spur"), server.endpoint)
         with world.opened:
             ada, bob = (Worker(world.join(name, x, -2.0)) for name, x in (("ada", 0.5), ("bob", 1.5)))
             world.until(lambda: "ada" in bob.client.remote_actors and "bob" in ada.client.remote_actors, 60.0)
@@ -231,17 +217,3 @@ def test_clients_over_zenoh_agree_by_hash():
             world.until(lambda: not any(differing(ada.client, other) for other in (bob.client, carl)), 60.0)
             assert (ada.physics.state.notch_depth > 0.2).sum() >= 2
             assert len(ada.physics.plants.stumps.table) >= 2
-
-
-def replayed(world: World, file: pathlib.Path) -> tuple[str, str]:
-    """Digests of a run that replays a recording: of all states, and of what has changed for good."""
-    bus = ReplayBus(read_recording(file), "viewer")
-    pose = frames.pose([1.0, -3.0, 1.6], frames.IDENTITY)
-    client = Spectator(world.scene, world.model, None, bus, name="viewer", pose=pose, clock=lambda: bus.time)
-    client.physics.wind = None
-    digest = StateDigest()
-    while not bus.ended:
-        bus.play(DT)
-        client.tick()
-        digest(client)
-    return digest.hexdigest(), lasting_digest(client.physics)

@@ -76,9 +76,10 @@ class WoodMonitor:
     """Finds the wood of awake trees that gives under its load.
 
     A joint of a cane whose elastic moment passes its capacity (:class:`vinesim.scene.strength.BendingLaw`) keeps a set:
-    its rest pose turns until the moment is the capacity, and its present pose stays. A joint that is about to pass its
-    capacity gives in advance, by the share phi (implicitness of the integrator) of what it will give in the next step.
-    So the moment with which that step is solved is the capacity: a fast hand does not feel more than the wood bears.
+    its rest pose turns until the moment is the capacity, and its present pose stays. A joint that will pass its
+    capacity in the next step turns its rest pose one step earlier, by phi (implicitness of the integrator) times the
+    expected turn. So the next step is solved with a moment equal to the capacity: a fast hand does not feel more than
+    the wood bears.
     A brittle joint breaks in the step in which its moment is nearest to its strength.
 
     A peduncle breaks at the end where its stress is larger, after it has been overloaded for ``detachment_duration``
