@@ -297,7 +297,7 @@ POLL = 1.0
 def _ask(processes: list[CrowdProcess], do: str = "report") -> list[dict[str, Any]]:
     """Send a command to all processes, and return their answers."""
     for process in processes:
-        process.send(do)
+        process.send(do=do)
     return [process.answer() for process in processes]
 
 

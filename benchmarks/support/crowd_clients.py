@@ -13,16 +13,16 @@ import contextlib
 import hashlib
 import json
 import queue
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
+from benchmarks.support.json_process import JsonProcess
 from vinesim.client.client import Client
 from vinesim.client.rate_loop import paced_loop
 from vinesim.core import frames
@@ -127,49 +127,12 @@ class Worker:
         }
 
 
-class CrowdProcess:
+class CrowdProcess(JsonProcess):
     """A process with some of the clients, as the benchmark controls it. A context manager."""
 
     def __init__(self, connect: str, numbers: list[int], count: int, apart: float) -> None:
-        wanted = json.dumps({"connect": connect, "numbers": numbers, "count": count, "apart": apart})
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "benchmarks.support.crowd_clients", wanted],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-
-    def send(self, do: str) -> None:
-        """Send a command; :meth:`answer` returns the answer."""
-        assert self.process.stdin is not None
-        self.process.stdin.write(json.dumps({"do": do}) + "\n")
-        self.process.stdin.flush()
-
-    def answer(self) -> dict[str, Any]:
-        """Returns the next answer."""
-        assert self.process.stdout is not None
-        line = self.process.stdout.readline()
-        if not line:
-            raise RuntimeError(f"a process of clients ended with {self.process.wait()}")
-        return json.loads(line)
-
-    def close(self) -> None:
-        """End the process."""
-        for pipe in (self.process.stdin, self.process.stdout):
-            if pipe is not None:
-                with contextlib.suppress(BrokenPipeError):
-                    pipe.close()
-        try:
-            self.process.wait(20.0)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        wanted = {"connect": connect, "numbers": numbers, "count": count, "apart": apart}
+        super().__init__("benchmarks.support.crowd_clients", wanted)
 
 
 def run(connect: str, numbers: list[int], count: int, apart: float) -> None:

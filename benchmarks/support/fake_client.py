@@ -10,7 +10,6 @@ Such a process reads JSON objects from its standard input, one a line, and answe
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 import pathlib
@@ -20,10 +19,11 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
+from benchmarks.support.json_process import JsonProcess
 from vinesim.core import frames
 from vinesim.net.codec.control import Hello
 from vinesim.net.replication import interest
@@ -267,7 +267,7 @@ def swinging_state(model: Model, tree: int, time: float, sway: float = SWAY) -> 
 # ---------------------------------------------------------------- in processes of their own
 
 
-class FakeClientProcess:
+class FakeClientProcess(JsonProcess):
     """Fake clients in a process of their own, as the process that started them controls them. A context manager."""
 
     def __init__(
@@ -280,46 +280,14 @@ class FakeClientProcess:
     ) -> None:
         """Start the process. ``start(command, **options of Popen)`` may start it in a network namespace; ``options`` as
         in :func:`run`."""
-        wanted = json.dumps({"connect": connect, "fake_clients": list(fake_clients), **options})
-        self.process = start(
-            [sys.executable, "-m", "benchmarks.support.fake_client", wanted],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        self._read_line()
+        wanted = {"connect": connect, "fake_clients": list(fake_clients), **options}
+        super().__init__("benchmarks.support.fake_client", wanted, start)
+        self.answer()
 
     def command(self, who: str = "", **command: Any) -> dict[str, Any]:
         """Send a command to the client ``who``; return the client's report after its next step."""
-        assert self.process.stdin is not None
-        self.process.stdin.write(json.dumps({"who": who, **command}) + "\n")
-        self.process.stdin.flush()
-        return self._read_line()
-
-    def _read_line(self) -> dict[str, Any]:
-        assert self.process.stdout is not None
-        line = self.process.stdout.readline()
-        if not line:
-            raise RuntimeError(f"the fake_clients' process ended with {self.process.wait()}")
-        return json.loads(line)
-
-    def close(self) -> None:
-        """Let the clients leave, and wait for the process."""
-        for pipe in (self.process.stdin, self.process.stdout):
-            if pipe is not None and not pipe.closed:
-                with contextlib.suppress(BrokenPipeError):
-                    pipe.close()
-        try:
-            self.process.wait(10.0)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        self.send(who=who, **command)
+        return self.answer()
 
 
 def run(
