@@ -9,6 +9,7 @@ import pytest
 from tests.support.contact_scenes import bunch_scene, grasp, gripper
 from vinesim.interaction import fruit_damage as law
 from vinesim.interaction.fruit_damage import FruitMonitor
+from vinesim.scene.berries import VARIETIES
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.values import RigidBox
 from vinesim.world import Physics
@@ -132,6 +133,32 @@ def test_the_figures_of_a_fall_depend_little_on_the_step(dt):
     assert found[1].drop_height == pytest.approx(found[0].drop_height, rel=0.03)
     assert found[1].peak_force == pytest.approx(found[0].peak_force, rel=0.2)
     assert found[1].acceleration == pytest.approx(found[0].acceleration, rel=0.2)
+
+
+@pytest.mark.parametrize("speed", [1.0, 5.0])
+def test_a_hanging_bunch_loses_berries_when_it_is_jerked(speed):
+    """The bunch gets a velocity within one step; a robot's slow motion shakes no berry off."""
+    model, _, _ = bunch_scene()
+    physics = Physics(model)
+    body = int(model.bunch_body[0])
+    physics.step()
+    physics.plants.state.joint_qd[body, 1] = speed / float(np.linalg.norm(model.body_com[body]))
+    physics.plants.wake(np.array([0]))
+    physics.step()
+    physics.step()
+    found = physics.fruit_monitor.history(0)
+    mass = VARIETIES[int(model.bunch_variety[0])].mass
+    expected = np.hypot(speed / 0.01, 9.81)
+    low, high = law.PULL_OFF
+    if mass * expected < low:
+        assert found.acceleration == found.berries_lost == 0.0
+        assert physics.fruit_monitor.handled() == ()
+        return
+    assert found.acceleration == pytest.approx(expected, rel=0.1)
+    share = (mass * found.acceleration - low) / (high - low)
+    assert found.berries_lost == pytest.approx(found.berries * share)
+    assert physics.fruit_monitor.handled() == (0,)
+    assert found.hand_time == 0.0
 
 
 def test_burst_berries_follow_from_the_forces_on_their_cells():

@@ -111,7 +111,10 @@ class FruitMonitor:
         self._recent = np.zeros((0, window, CELLS[0] * CELLS[1]))
         """[row, step, cell] N, forces of the last steps; the step is counted modulo their number."""
         self._velocity = np.full((0, window, 3), np.nan)
-        """[row, step, 3] m/s, velocities in the last steps; the oldest first."""
+        """[row, step, 3] m/s, velocities of free bunches in the last steps; the oldest first."""
+        self._hanging_velocity = np.zeros((window, count, 3))
+        """[step, bunch, 3] m/s, velocities of the middles of hanging bunches in the last steps; the step is counted
+        modulo their number. Zero for bunches that sleep, NaN for those that are not simulated here."""
         self._counted = np.zeros((0, 2), int)
         """[row, 2] Whole numbers of burst and lost berries that events have told."""
         self._generation = -1
@@ -141,6 +144,8 @@ class FruitMonitor:
                 free = free[:, ~self.remote[free[0]]]
         if hand_contacts:
             touches.append(self._held_plants(hand_contacts))
+        if len(self.plants.awake):
+            self._add_shaking()
         supported = np.zeros(len(self._row), bool)
         if touches:
             supported[self._add_touches(touches)] = True
@@ -222,8 +227,9 @@ class FruitMonitor:
         self._told[bunch] = np.maximum(self._told[bunch], (burst, lost))
 
     def handled(self) -> tuple[int, ...]:
-        """Returns the bunches that actors touched or that fell, sorted."""
-        return tuple(sorted(self._bunch[(self._hand_time > 0.0) | (self._drops > 0)].tolist()))
+        """Returns the bunches that actors touched, that fell or that were shaken until they lost berries, sorted."""
+        shaken = self._acceleration * self._berry_mass[self._bunch] > PULL_OFF[0]
+        return tuple(sorted(self._bunch[(self._hand_time > 0.0) | (self._drops > 0) | shaken].tolist()))
 
     # ------------------------------------------------------------------ contacts of a step
     # as bunches, forces across their surfaces [N], points [3] m, and whether an actor presses
@@ -357,6 +363,35 @@ class FruitMonitor:
             self._acceleration[rows] = np.maximum(self._acceleration[rows], acceleration)
             self._is_worse = True
         self._velocity[rows] = np.concatenate([self._velocity[rows, 1:], velocity[:, None]], axis=1)
+
+    def _add_shaking(self) -> None:
+        """Add the accelerations of hanging bunches that lose berries by them."""
+        plants = self.plants
+        model = plants.model
+        window = len(self._hanging_velocity)
+        trees = model.body_tree[model.bunch_body]
+        is_here = plants.state.bunch_attached & ~self.contact_solver.remote_trees[trees]
+        bunch = np.flatnonzero(is_here & plants.state.tree_awake[trees])
+        body = model.bunch_body[bunch]
+        twist = plants.state.body_qd[body]
+        lever = frames.rotate(plants.state.body_q[body, 3:], model.body_com[body])
+        velocity = twist[:, :3] + frames.cross(twist[:, 3:], lever)
+        oldest = self._hanging_velocity[plants.tick % window]
+        change = velocity - oldest[bunch]
+        change[:, 2] += self.rigid.parameters.gravity * window * plants.dt
+        oldest[:] = np.where(is_here, 0.0, np.nan)[:, None]
+        oldest[bunch] = velocity
+        acceleration = np.sqrt(np.einsum("bi,bi->b", change, change)) / (window * plants.dt)
+        loses = np.nan_to_num(acceleration) * self._berry_mass[bunch] > PULL_OFF[0]
+        if not loses.any():
+            return
+        bunch = bunch[loses]
+        acceleration = acceleration[loses]
+        self._add_rows(bunch)
+        rows = self._row[bunch]
+        if (acceleration > self._acceleration[rows]).any():
+            self._acceleration[rows] = np.maximum(self._acceleration[rows], acceleration)
+            self._is_worse = True
 
     def _berries(self, rows: np.ndarray) -> np.ndarray:
         """Returns the expected numbers [row, 2] of burst and of lost berries."""
