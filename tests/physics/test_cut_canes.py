@@ -302,6 +302,26 @@ def test_a_stump_and_a_piece_can_be_cut_again():
         assert total == pytest.approx(level_cane().body_mass.sum(), rel=1e-6)
 
 
+@pytest.mark.parametrize("length", [0.01, 0.026, 0.06])
+def test_a_short_piece_comes_to_rest_on_the_ground(length):
+    """With one contact, at its lower end, it rocked from step to step at 10 rad/s without end."""
+    physics = Physics(level_cane())
+    physics.cut(9, length)
+    for _ in range(100):
+        physics.step()
+    (stump,) = physics.plants.stumps.table[:, 0].astype(int).tolist()
+    physics.cut(stump, 0.0)
+    while physics.plants.awake.size:
+        physics.step()
+        assert physics.time < 30.0, f"it turns at {physics.state.body_qd[stump, 3:]} rad/s"
+    radius = 0.004
+    start, end = physics.plants.body_start[stump], physics.plants.body_end[stump]
+    points = np.array([[start, 0.0, 0.0], [end, 0.0, 0.0]])
+    pose = physics.state.body_q[stump].astype(float)
+    heights = (pose[:3] + frames.rotate(pose[3:], points))[:, 2]
+    assert heights == pytest.approx([radius, radius], abs=3e-4)
+
+
 def test_without_a_spare_body_the_cut_is_at_the_joint_and_says_so(caplog):
     physics = Physics(level_cane())
     physics.cut(8, 0.05)

@@ -23,6 +23,7 @@ from vinesim.kernels.contact.candidates import Candidate, curvature_gap, is_smoo
 from vinesim.kernels.contact.distance import (
     HEIGHT_FIELD,
     MESH,
+    PLANE,
     has_flat_or_straight_side,
     interval_along_face,
     is_outside_box,
@@ -285,7 +286,9 @@ def contact_ends(
     to_local = wp.transpose(rotation)
     local_a = to_local * (a - center)
     local_b = to_local * (b - center)
-    if not is_round and geoms.kind[g] == MESH:
+    if geoms.kind[g] == PLANE:
+        ends = wp.vec2d(wp.float64(0.0), wp.float64(1.0))
+    elif not is_round and geoms.kind[g] == MESH:
         normal = to_local * wp.vec3d(nearest[0], nearest[1], nearest[2])
         local = vec5d(normal[0], normal[1], normal[2], nearest[3], nearest[4])
         ends = interval_along_hull(hulls, geoms.hull[g], local_a, local_b, local, parameters.margin)
