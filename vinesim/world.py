@@ -14,7 +14,6 @@ import numpy as np
 from vinesim.contact.contact_solver import ContactSolver
 from vinesim.core import frames
 from vinesim.interaction.blades import Blade
-from vinesim.interaction.breaking import WireBreak
 from vinesim.interaction.detachment import DetachmentMonitor
 from vinesim.interaction.dormant_bunches import DormantBunches
 from vinesim.interaction.fruit_damage import FruitMonitor
@@ -42,6 +41,7 @@ from vinesim.scene.values import (
     RigidVisual,
     RobotSpec,
     Snapshot,
+    WireBreak,
 )
 from vinesim.scene.wind import Wind
 from vinesim.wind.plant_wind import WindOnPlants

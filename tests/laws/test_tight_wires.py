@@ -9,6 +9,7 @@ from scipy.optimize import brentq
 from tests.laws.test_pressed_wires import BEYOND, THICK, press, rod, run
 from tests.laws.test_wires import ARM, LENGTH, SPRING, TENSION, push, row_of_shoots, tips, world
 from vinesim.api.energy import energy
+from vinesim.client.vine_events import events_of
 from vinesim.scene.generation.fixed_structure import wire_stretch
 from vinesim.scene.model import Model
 from vinesim.world import Physics
@@ -94,6 +95,8 @@ def test_a_stronger_push_breaks_the_wire_and_frees_its_ties() -> None:
     assert one.piece == 0
     assert strength <= one.tension < 1.05 * strength
     assert one.ties == (0, 1, 2, 3)
+    (row,) = [event for event in events_of(physics) if event["event"] == "wire"]
+    assert row == {"event": "wire", "piece": 0, "tension_n": one.tension, "ties": [0, 1, 2, 3]}
     assert physics.state.tie_broken.all()
     assert [event.kind for event in physics.detachment_monitor.breakages] == ["untie"] * 4
     physics.rigid.set_gains("probe", *gains, np.array([0.0, 5.0]))

@@ -53,6 +53,7 @@ from vinesim.scene.values import (
     FruitEvent,
     RigidBox,
     Snapshot,
+    WireBreak,
 )
 from vinesim.scene.wind import Wind, wind_of
 from vinesim.wind.sway import Sway
@@ -136,6 +137,7 @@ class Simulation:
         self._detachments: list[Detachment] = []
         self._breakages: list[Breakage] = []
         self._closings: list[BladeClosing] = []
+        self._wire_breaks: list[WireBreak] = []
         self._fruit_events: list[FruitEvent] = []
         self._holds: list[Hold] = []
         self._primitives: Primitives | None = None
@@ -157,6 +159,7 @@ class Simulation:
         self._detachments = []
         self._breakages = []
         self._closings = []
+        self._wire_breaks = []
         self._fruit_events = []
         for name in self.robots.keys() - set(self.physics.rigid.robots):  # robots that are no longer in the physics
             self._forget_robot(name)
@@ -171,6 +174,7 @@ class Simulation:
             self._detachments += self.physics.detachments
             self._breakages += self.physics.detachment_monitor.breakages
             self._closings += self.physics.closings
+            self._wire_breaks += self.physics.wire_breaks
             self._fruit_events += self.physics.fruit_monitor.events
         for body, before in self._loads.items():
             self.physics.plants.body_load[body] = before
@@ -242,6 +246,11 @@ class Simulation:
         """Closings of blades that ended in the last call of :meth:`step`: force, energy, depth, and why a blade did not
         close."""
         return tuple(self._closings)
+
+    @property
+    def wire_breaks(self) -> tuple[WireBreak, ...]:
+        """Pieces of wire that broke in the last call of :meth:`step`: tension [N], and the ties that they held."""
+        return tuple(self._wire_breaks)
 
     @property
     def fruit_events(self) -> tuple[FruitEvent, ...]:

@@ -7,15 +7,17 @@ from __future__ import annotations
 
 from typing import Any
 
-from vinesim.scene.values import BladeClosing, Breakage, BunchHistory, Detachment, FruitEvent
+from vinesim.scene.values import BladeClosing, Breakage, BunchHistory, Detachment, FruitEvent, WireBreak
 from vinesim.world import Physics
 
 
 def events_of(physics: Physics) -> list[dict[str, Any]]:
-    """Returns the events of the last step: closings of blades, what gave, detachments, and those of fruit."""
+    """Returns the events of the last step: closings of blades, what gave, wires that broke, detachments, and those of
+    fruit."""
     fruit = [_fruit(physics, event) for event in physics.fruit_monitor.events]
     given = map(_breakage, physics.detachment_monitor.breakages)
-    return [*map(_closing, physics.closings), *given, *map(_detachment, physics.detachments), *fruit]
+    wires = map(_wire_break, physics.wire_breaks)
+    return [*map(_closing, physics.closings), *given, *wires, *map(_detachment, physics.detachments), *fruit]
 
 
 def fruit_report(physics: Physics) -> dict[str, Any]:
@@ -101,3 +103,7 @@ def _breakage(event: Breakage) -> dict[str, Any]:
         "place_m": float(event.place),
         "position": [float(part) for part in event.point],
     }
+
+
+def _wire_break(event: WireBreak) -> dict[str, Any]:
+    return {"event": "wire", "piece": event.piece, "tension_n": event.tension, "ties": list(event.ties)}

@@ -59,19 +59,6 @@ class Overload:
     """Whether the wood has only cracked."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class WireBreak:
-    """The event that a piece of wire broke between two posts. The ties on it hold nothing any more."""
-
-    tick: int
-    piece: int
-    """Index of the fixed piece."""
-    tension: float
-    """[N] Tension at which it broke."""
-    ties: tuple[int, ...]
-    """Ties that the wire held until then."""
-
-
 class WoodMonitor:
     """Finds the wood of awake trees that gives under its load.
 

@@ -21,7 +21,6 @@ from vinesim.interaction.breaking import (
     NOTCH,
     UNTIE,
     Overload,
-    WireBreak,
     WoodMonitor,
     distance_from_base,
 )
@@ -33,7 +32,7 @@ from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene.ids import Organ
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.spare_bodies import PLACE_STEP
-from vinesim.scene.values import BladeClosing, Breakage, Contact, Detachment
+from vinesim.scene.values import BladeClosing, Breakage, Contact, Detachment, WireBreak
 from vinesim.wires.elastic_supports import ElasticSupports
 
 log = logging.getLogger(__name__)

@@ -63,6 +63,7 @@ from vinesim.scene.values.world import (
     SegmentPoses,
     Snapshot,
     WindState,
+    WireBreak,
 )
 
 __all__ = [
@@ -135,5 +136,6 @@ __all__ = [
     "Stalk",
     "TreeUpdate",
     "WindState",
+    "WireBreak",
     "Wrench",
 ]

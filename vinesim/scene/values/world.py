@@ -154,6 +154,19 @@ class Breakage:
     """[m] Place in the world."""
 
 
+@dataclasses.dataclass(frozen=True, slots=True)
+class WireBreak:
+    """The event that a piece of wire broke between two posts. The ties on it hold nothing any more."""
+
+    tick: int
+    piece: int
+    """Index of the fixed piece."""
+    tension: float
+    """[N] Tension at which it broke."""
+    ties: tuple[int, ...]
+    """Ties that the wire held until then."""
+
+
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class GivenWood:
     """How one tree has changed for good, besides cuts: joints [k] with a set, ties [j] that have slipped or broken,
