@@ -254,6 +254,11 @@ def test_a_person_in_a_browser_takes_shears_and_cuts_a_bunch(page):
         wait(lambda: page.run("document.getElementById('hold').innerText") == "Space cut", "nothing is between them")
         page.run("document.getElementById('shears').click()")
         wait(lambda: not page.run(drawn), "they are put away")
+        press(page, "KeyL")
+        wait(lambda: len(page.run("vinesim.viewer.handwork.told")) == 1, "the hand does something, or says why not")
+        page.run("document.querySelector('[data-work=tie]').click()")
+        wait(lambda: len(page.run("vinesim.viewer.handwork.told")) == 2, "a button does the same")
+        assert page.run("vinesim.viewer.handwork.told.every((said) => said.startsWith('The right hand '))")
         assert page.errors == []
 
 

@@ -20,7 +20,7 @@ from vinesim.scene.spec import load_scene
 from vinesim.scene.state import State
 from vinesim.scene.values import INTENTIONS, HumanSpec, LightPattern
 from vinesim.web.array_message import decode
-from vinesim.web.page_input import PageInput, TrackedHand, TrackedPerson
+from vinesim.web.page_input import PageInput, PlantWork, TrackedHand, TrackedPerson
 from vinesim.wires.wire_segments import wire_segments
 
 
@@ -323,6 +323,42 @@ def test_a_page_is_told_of_the_shears_in_its_persons_hand_and_of_what_they_cut(a
     told, names, _ = shown(shears=False, closed=False)
     assert told["shears"]["closures"] == 3
     assert not set(parts) & set(names)
+
+
+def test_a_person_takes_leaves_off_ties_and_unties_what_is_at_the_right_hand_once_for_each_wish(anna):
+    client, world = anna
+    world.scene()
+    model = client.model
+    leafy = int(np.bincount(model.leaf_body[model.body_organ[model.leaf_body] == int(Organ.CANE)]).argmax())
+    half = frames.pose(np.array([0.5 * model.body_length[leafy], 0.0, 0.0]))
+    place = frames.compose(client.physics.state.body_q[leafy].astype(float), half)[:3]
+    turn = (0.0, 0.0, 0.0, 1.0)
+
+    def told(palm, *work):
+        """What a page is told after it has sent wishes, each in two messages."""
+        x, y, z = palm
+        head = (x - 0.4, y, 1.6, *turn)
+        for wish in work or (None,):
+            for _ in range(2):
+                hand = TrackedHand((x, y, z, *turn))
+                world.take(0, PageInput(1, head, TrackedPerson(head, None, hand, work=wish)))
+                for _ in range(10):
+                    client.tick()
+        return decode(world.state(-1)[1])[0]["work"]
+
+    assert told(place) == {"count": 0, "said": []}
+    before = client.physics.state.leaf_off.sum()
+    answer = told(place, PlantWork("take_leaves", 1))
+    taken = client.physics.state.leaf_off.sum() - before
+    assert taken > 0
+    assert answer["count"] == 1
+    assert answer["said"][0].startswith(f"The right hand takes {taken} leaves off body")
+    answer = told(place, PlantWork("tie", 2), PlantWork("untie", 3))
+    assert answer["count"] == 3
+    assert "The right hand ties body" in answer["said"][1]
+    assert "The right hand opens " in answer["said"][2]
+    answer = told((-2.0, 0.0, 1.2), PlantWork("tie", 4))
+    assert answer["said"][-1].startswith("The right hand does nothing: no cane within 100 mm")
 
 
 def test_a_flash_of_a_light_reloads_no_body_of_a_page():

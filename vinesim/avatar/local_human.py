@@ -86,6 +86,15 @@ class LocalHuman:
         )
         return HumanUpdate(self.name, now, pose, velocity, self.intention)
 
+    def work(self, what: str, side: str = "right") -> str:
+        """Work on the plant next to a hand, between steps: ``what`` is one of
+        :data:`vinesim.interaction.handwork.PLANT_WORK`. Returns what was done, or why nothing was, as a sentence."""
+        palm = self.physics.hand(self.name, side).pose[:3]
+        try:
+            return f"The {side} hand {self.physics.handwork.work_at(what, palm, self.name)}."
+        except ValueError as error:
+            return f"The {side} hand does nothing: {error}."
+
     def between_blades(self) -> tuple[str, ...]:
         """Returns what the shears in the left and in the right hand would cut now, see :meth:`Shears.between`; "" for a
         hand without shears."""

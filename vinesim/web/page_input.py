@@ -4,7 +4,7 @@ person's head and hands."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -27,6 +27,15 @@ class TrackedHand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Bend of thumb, index, middle, ring and little finger, from 0 to 1."""
 
 
+class PlantWork(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Work on the plant next to the person's right hand."""
+
+    what: Literal["tie", "untie", "take_leaves"]
+    """As in :data:`vinesim.interaction.handwork.PLANT_WORK`."""
+    number: Annotated[int, msgspec.Meta(ge=1)]
+    """Number of this wish in the page. The page repeats its newest wish in every message."""
+
+
 class TrackedPerson(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """State of a person from a headset, or from mouse and keys. A hand that is None hangs down."""
 
@@ -37,6 +46,8 @@ class TrackedPerson(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Intention that the person indicates; empty: none."""
     shears: tuple[bool, bool] = (False, False)
     """Whether the left and the right hand have shears."""
+    work: PlantWork | None = None
+    """Newest work that the page's user wants; None: none so far."""
 
 
 class ReplayCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

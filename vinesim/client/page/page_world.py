@@ -53,8 +53,8 @@ AMONG_VINES = 1.08
 """Ratio of a page's exposure to the usual daylight exposure. Automatic exposure of cameras among vines yields 1.06 to
 1.12 in the pictures of docs/web.md."""
 MAX_SENTENCES = 4
-"""Largest number of texts about recent closings of the person's shears in one state for a page. Enough for both hands
-between two states."""
+"""Largest number of texts about recent closings of the person's shears, or about recent work, in one state for a page.
+Enough for both hands between two states."""
 BLADE_STEPS = 5
 """Number of steps between two reports of the wood that is between the blades of shears."""
 _TURN_STEPS = 32767
@@ -154,6 +154,12 @@ class PageWorld:
         self._shears: dict[str, Any] = {"closures": 0, "said": [], "between": ["", ""]}
         """Number of closings of the person's shears, their last results, and what is between the open blades of both
         hands. The dictionary is replaced, never changed."""
+        self._wishes: list[str] = []
+        """Work on plants that pages have asked for, and that is not done yet."""
+        self._newest_wish: tuple[int, int] | None = None
+        """Page and number of the last wish in ``_wishes``."""
+        self._work: dict[str, Any] = {"count": 0, "said": []}
+        """Number of wishes that were answered, and the last answers. The dictionary is replaced, never changed."""
 
     # ------------------------------------------------------------------ in the client's loop
 
@@ -178,7 +184,7 @@ class PageWorld:
 
     def collect(self, server: PageServer, *, again: bool = False) -> None:
         """Record the results of a step for pages: what has moved, and a snapshot if a page is connected. Also applies
-        what pages have requested: the eyes of a spectator, and the intention of a person.
+        what pages have requested: the eyes of a spectator, the intention of a person, and the person's work on plants.
 
         ``again``: whether pages must receive a new state although there was no step.
         """
@@ -191,6 +197,9 @@ class PageWorld:
             human = self._client.humans[self._client.name]
             if human.intention != self._intention:
                 human.indicate(self._intention)
+            while self._wishes:
+                said = [*self._work["said"], human.work(self._wishes.pop(0))]
+                self._work = {"count": self._work["count"] + 1, "said": said[-MAX_SENTENCES:]}
             for haptic in human.haptics:
                 if (before := self._haptics.get(haptic.hand)) is None or before.amplitude < haptic.amplitude:
                     self._haptics[haptic.hand] = haptic
@@ -357,6 +366,7 @@ class PageWorld:
             shown["replay"] = self._replay.status()
         if self._person is not None:
             shown["shears"] = self._shears
+            shown["work"] = self._work
             shown["held"] = self._held
             driver = self._driver
             shown["control"] = "" if driver is None else "this" if driver == page else "other"
@@ -444,6 +454,11 @@ class PageWorld:
             self._person.take(_tracked(said.person))
             if said.person.intention in INTENTIONS:
                 self._intention = said.person.intention
+            work = said.person.work
+            if work is not None and self._newest_wish != (page, work.number):
+                self._newest_wish = page, work.number
+                if len(self._wishes) < MAX_SENTENCES:
+                    self._wishes.append(work.what)
 
     def leave(self, page: int) -> None:
         """Forget a page that has disconnected. If it controlled the eyes, another page does so now. If it controlled

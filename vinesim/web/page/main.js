@@ -6,6 +6,7 @@ import { decode, load, socketAddress } from "./arrays.js";
 import { FlyingEyes } from "./fly.js";
 import { Guide } from "./guide.js";
 import { ARM, Hand } from "./hand.js";
+import { Handwork } from "./handwork.js";
 import { Headset } from "./headset.js";
 import { Absence, isUnusual, say } from "./notices.js";
 import { Overlays } from "./overlays.js";
@@ -93,6 +94,7 @@ class Viewer {
     this.rig = new THREE.Group();
     this.scene.add(this.rig);
     this.shears = new Shears(mouth, world.group);
+    this.handwork = new Handwork(this.isPerson);
     this.headset = new Headset(
       this.renderer,
       this.rig,
@@ -246,6 +248,7 @@ class Viewer {
     for (const [hand, pulse] of Object.entries(state.haptics)) page.haptics[hand] = pulse;
     this.headset.pulse(state.haptics);
     if (this.shears.take(state)) this.hand?.cut();
+    this.handwork.take(state);
     if (state.rigid > Math.max(this.world.rigidVersion, this.shapes?.version ?? 0) && !this.loading) {
       this.loading = true;
       this.shapes = await load("rigid").catch(() => null); // if the client has ended meanwhile, the socket waits for it
@@ -291,6 +294,7 @@ class Viewer {
       if (!actors.length) say(NOBODY);
     }
     if (code === "KeyT") this.shears.toggle("right");
+    this.handwork.press(code);
     if (code === "KeyN") {
       element("names").hidden = !element("names").hidden;
       element("label").setAttribute("aria-pressed", String(!element("names").hidden));
@@ -429,7 +433,8 @@ class Viewer {
   message(pose) {
     const message = { drawn: page.tick, view: pose, overlays: this.overlays.areShown };
     if (!this.isPerson) return message;
-    return { ...message, person: { ...this.person, intention: this.intention, shears: this.shears.inHands } };
+    const wishes = { intention: this.intention, shears: this.shears.inHands, work: this.handwork.asked };
+    return { ...message, person: { ...this.person, ...wishes } };
   }
 
   /** The person's tracked head and hands in this frame, a time [s] after the last one. */
