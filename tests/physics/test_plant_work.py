@@ -12,6 +12,7 @@ from vinesim.scene.cane import CaneBuilder
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
+from vinesim.world import Physics
 
 pytestmark = pytest.mark.slow
 
@@ -158,3 +159,19 @@ def test_work_that_is_impossible_is_refused_with_one_line(vine: Model) -> None:
         simulation.hold(other)
     with pytest.raises(UsageError, match="are held already"):
         simulation.hold(simulation.parameters.max_held_bodies)
+
+
+def test_a_cane_that_is_tied_back_on_itself_sleeps_where_it_stays():
+    """Its tangent stiffness is not positive definite, so the distance from its rest pose is unknown."""
+    model = CaneBuilder(length=1.0, radius=0.004, youngs_modulus=5e9, density=800.0, segments=10, shape="slack").build()
+    physics = Physics(model)
+    physics.handwork.bind(8, 0.05, model.forward_kinematics(model.joint_settled)[2, :3].astype(float), "ada")
+    while physics.time < 1.0 or physics.plants.awake.size:
+        physics.step()
+        assert physics.time < 60.0
+    slept = physics.state.body_q[:, :3].copy()
+    physics.wake(np.array([0]))
+    for _ in range(300):
+        physics.step()
+    physics.update_kinematics()
+    np.testing.assert_allclose(physics.state.body_q[:, :3], slept, atol=1e-4)

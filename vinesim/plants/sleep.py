@@ -15,6 +15,7 @@ import warp as wp
 
 from vinesim.core.warp_arrays import share
 from vinesim.kernels.graph import KernelGraph, KernelLaunch
+from vinesim.kernels.plants.residual_motion import FAR
 from vinesim.kernels.plants.tree_checks import count_quiet_steps
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.plants.equilibrium import EquilibriumFinder
@@ -32,11 +33,12 @@ travel of 1 cm.
 """
 
 STILL_DURATION = 5.0
-"""[s] Duration after which a tree in contact, or a cut-off part, counts as at rest if none of its bodies has moved by
-more than :data:`CONTACT_SHARE` of ``sleep_distance``. This rule is needed because the tangent stiffness does not
-contain the supporting contacts, so the distance from rest may be overestimated. A tree that creeps with a time constant
-of five times this duration falls asleep 0.05 mm from its rest pose. TUNED.
-"""
+"""[s] Duration after which some trees count as at rest if none of their bodies has moved by more than
+:data:`CONTACT_SHARE` of ``sleep_distance``: trees in contact, cut-off parts, and trees whose distance from rest is not
+known. In contact the distance may be overestimated, because the tangent stiffness does not contain the supporting
+contacts. The distance is not known where the tangent stiffness is not positive definite, as in some canes that an actor
+has tied. A tree that creeps with a time constant of five times this duration falls asleep 0.05 mm from its rest pose.
+TUNED."""
 
 _NO_PAIRS = np.zeros((0, 2), np.int32)
 
@@ -148,6 +150,7 @@ class SleepMonitor:
         speed, distance, is_free = self._equilibrium.residual_motion(slow)
         tolerance = np.where(is_free, self.distance, CONTACT_SHARE * self.distance)
         self._is_at_rest[slow] = (speed < self.speed) & (distance < tolerance)
+        is_free &= distance < 0.5 * FAR
         if len(bound := slow[~is_free & (speed < self.speed)]):
             self._find_still(bound)
         stays = ~self._is_at_rest if keep_awake is None else ~self._is_at_rest | keep_awake
