@@ -143,6 +143,9 @@ class RigidBatch:
         made.row_count = self.model.M_rownnz
         made.column = self.model.M_colind
         made.nefc = self.data.nefc
+        made.J_rownnz = self.data.efc.J_rownnz
+        made.J_rowadr = self.data.efc.J_rowadr
+        made.J_colind = self.data.efc.J_colind
         made.J = self.data.efc.J
         made.D = self.data.efc.D
         made.state = self.data.efc.state
