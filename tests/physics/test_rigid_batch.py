@@ -47,3 +47,22 @@ def test_joints_at_their_limits_resist_as_in_a_client():
     np.testing.assert_allclose(limited, response, rtol=1e-4, atol=1e-5 * np.abs(response).max())
     held = robot.v[[1, 3]]
     assert (np.diag(limited)[held] < 0.1 * np.diag(free)[held]).all()
+
+
+@pytest.mark.slow
+def test_a_joint_that_its_servo_presses_beyond_its_limit_moves_as_in_a_client():
+    """Half a second without plants in reach. The limit must not be stiffer in the second half of a step."""
+    client, batch = world(), RigidBatch(world(), 1)
+    wanted = np.array([0.0, -3.0, 0.0, 3.0, 0.5, 1.0, 0.0, 0.0, 0.0])
+    client.command("arm", wanted)
+    batch.targets.assign(wanted[None].astype(np.float32))
+    for _ in range(50):
+        client.predict()
+        client.integrate()
+        batch.predict()
+        wp.copy(batch.likely_acceleration, batch.data.qacc)
+        batch.integrate()
+    robot = client.robot("arm")
+    beyond = np.abs(client.mj_data.qpos[robot.q[[1, 3]]]) - JOINT_LIMIT
+    assert (beyond > 1e-4).all()
+    np.testing.assert_allclose(batch.data.qpos.numpy()[0], client.mj_data.qpos, atol=1e-5)

@@ -553,8 +553,12 @@ class BatchContacts:
                     worlds,
                     self._dofs,
                     self.rows,
+                    self.contacts,
+                    self._geoms.count,
                     contacts,
+                    self.bodies.data.qacc,
                     self.bodies.applied,
+                    self.bodies.likely_acceleration,
                 )
             )
         return launches

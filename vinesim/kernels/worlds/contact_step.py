@@ -477,21 +477,31 @@ def add_contact_efforts(
     worlds: int,
     dofs: int,
     rows_all: Rows,
+    contacts_all: Contacts,
+    moving: wp.array(dtype=wp.int32),
     world_contacts: WorldContacts,
+    qacc: wp.array2d(dtype=float),
     # out
     effort_out: wp.array2d(dtype=float),
+    likely_out: wp.array2d(dtype=float),
 ):
     """One thread per degree of freedom of a world's rigid bodies. Write the generalised force of the contacts with
-    plants.
+    plants, and the acceleration with this force if all constraints keep their states.
 
-    effort: [world, dof] N or N m.
+    moving: [1] number of geoms that can move. qacc: [world, dof] m/s^2 or rad/s^2, acceleration without these contacts.
+    effort: [world, dof] N or N m. likely: [world, dof] m/s^2 or rad/s^2.
     """
     world = wp.tid() % worlds
     dof = wp.tid() / worlds
     rows = view_rows(rows_all, world, worlds, dofs)
     effort = wp.float64(0.0)
+    change = wp.float64(0.0)
     for c in range(world_contacts.count[world]):
-        entry = rows.rigid_jacobian[c, dof]
-        for r in range(3):
-            effort = effort - entry[r] * rows.impulse[3 * c + r]
+        if contacts_all.other[c * worlds + world] < moving[0]:
+            entry = rows.rigid_jacobian[c, dof]
+            response = rows.rigid_response[c, dof]
+            for r in range(3):
+                effort = effort - entry[r] * rows.impulse[3 * c + r]
+                change = change - response[r] * rows.impulse[3 * c + r]
     effort_out[world, dof] = wp.float32(effort / parameters.dt)
+    likely_out[world, dof] = qacc[world, dof] + wp.float32(change / parameters.dt)
