@@ -671,10 +671,10 @@ class ArticulationSolver:
         """Take many steps of the awake trees without sleep and fault guard. ``between`` launches the kernels that run
         between prediction and integration, such as contacts.
 
-        A GPU works on its own copies of all arrays: call :meth:`upload` before and :meth:`download` after. During the
-        steps nothing is copied between host and GPU. Afterwards ``velocity_free`` and ``acceleration`` hold the values
-        of the last step. A tree whose motion became invalid (``tree_rate`` NaN or above ``fault_rate``) keeps its last
-        valid pose.
+        A GPU works on its own copies of all arrays: call :meth:`upload` after each change of an array on the host, and
+        :meth:`download` after the steps. During the steps nothing is copied between host and GPU. Afterwards
+        ``velocity_free`` and ``acceleration`` hold the values of the last step. A tree whose motion became invalid
+        (``tree_rate`` NaN or above ``fault_rate``) keeps its last valid pose.
         """
         self._runner.list_trees(self._awake)
         floating = self._floating_roots()
@@ -691,6 +691,7 @@ class ArticulationSolver:
     def upload(self) -> None:
         """Copy the host's arrays of the awake trees to the device; on a CPU there is nothing to copy."""
         self._runner.list_trees(self._awake)
+        self._runner.uploaded = None
         self.launches.upload_step(len(self._runner.stepped))
         self.buffers.synchronize()
 
@@ -1472,8 +1473,8 @@ class KernelLaunches:
     them. The model's rows are copied by :meth:`upload_changed` when :attr:`changed` is set. A GPU reads all other
     arrays in the host's memory. In a sequence of many steps (:meth:`ArticulationSolver.advance`) these reads would take
     longer than the steps. So for such a sequence the GPU also has copies of :data:`TREE_INPUTS`, and separate launches
-    that use them (:attr:`resident`). The sequence begins with :meth:`upload_trees` and ends with
-    :meth:`download_trees`.
+    that use them (:attr:`resident`). The sequence begins with :meth:`upload_trees` if the host may have changed an
+    array, and ends with :meth:`download_trees`.
     """
 
     def __init__(self, solver: ArticulationSolver, parameters: dict[str, float], max_substeps: int) -> None:
@@ -2219,6 +2220,9 @@ class StepRunner:
         """[k] Number of substeps of each tree of :attr:`fast` when the list was last sorted."""
         self._graph: wp.Graph | None = None
         self._graph_of: tuple = ()
+        self.uploaded: bytes | None = None
+        """The counts with which :meth:`advance` last uploaded arrays of trees. None: the host may have changed an array
+        since."""
         self._topologies = topologies
         self._starts = np.zeros(1, np.int32)
         """Index in the list at which each group begins; the last entry is the length of the list."""
@@ -2250,6 +2254,7 @@ class StepRunner:
 
     def _order(self) -> None:
         """Sort the list of trees by the number of substeps of each tree in ``_steps_of``."""
+        self.uploaded = None
         trees = self.stepped
         on_cpu = self._buffers.device.is_cpu
         topologies = self._topologies.of(trees)
@@ -2313,6 +2318,7 @@ class StepRunner:
 
     def predict(self) -> None:
         """Predict the listed trees over the whole step."""
+        self.uploaded = None
         if len(self.fast):
             self._steps_of[self.fast] = 1
         groups = len(self._starts) - 1
@@ -2350,7 +2356,10 @@ class StepRunner:
             return
         self._count(steps)
         self._counts[_GROUPS] = self._whole_groups
-        self._launches.upload_trees()
+        counts = self._counts.tobytes()
+        if self.uploaded != counts or len(self.fast) or len(roots):
+            self._launches.upload_trees()
+            self.uploaded = counts
         if not self._buffers.device.is_cpu:
             what = (self._whole_groups, self._room, len(self._levels), self._kind, between)
             if self._graph is None or self._graph_of != what:
