@@ -1890,13 +1890,14 @@ class KernelLaunches:
         kind, phi = (self.buffers.host[name][trees] for name in ("tree_budget", "tree_phi"))
         self._watches_closely = bool(((kind == CLOSELY) | (phi < MIN_PHI)).any())
 
-    def keeps_budgets(self, steps: int = 1) -> bool:
-        """Returns whether the next ``steps`` steps keep energy budgets. Call it once before their integrations.
+    def keeps_budgets(self, *, every: bool = False) -> bool:
+        """Returns whether the next steps keep energy budgets. Call it once before their integrations.
 
-        On a GPU, and with more than one step, all steps keep budgets. Otherwise one step in :data:`BUDGET_PERIOD` keeps
-        budgets. If a tree is watched closely after that step, all steps up to the next such step keep budgets, too.
+        On a GPU, and if ``every`` step shall, all steps keep budgets, so that no tree depends on others. Otherwise one
+        step in :data:`BUDGET_PERIOD` keeps budgets. If a tree is watched closely after that step, all steps up to the
+        next such step keep budgets, too.
         """
-        self._budget_phase = (self._budget_phase + 1) % BUDGET_PERIOD if steps == 1 else 0
+        self._budget_phase = 0 if every else (self._budget_phase + 1) % BUDGET_PERIOD
         if self._budget_phase == 0 or self.buffers.device.is_cuda:
             self._keeps_budgets = len(self._budgeted) > 0
         elif self._budget_phase == 1 and self._keeps_budgets:
@@ -2299,10 +2300,11 @@ class StepRunner:
         self._lists["floating"][: self._roots] = roots[: self._roots]
         self._lists["divided_floating"][: len(roots) - self._roots] = roots[self._roots :]
 
-    def _count(self, steps: int = 1) -> None:
-        """Write the number of entries of each list that the kernels of the integrations process."""
+    def _count(self, *, every: bool = False) -> None:
+        """Write the number of entries of each list that the kernels of the integrations process. ``every``: see
+        :meth:`KernelLaunches.keeps_budgets`."""
         counts = self._counts
-        self._kind = (self._launches.keeps_budgets(steps), self._roots + len(self._root_levels) > 0)
+        self._kind = (self._launches.keeps_budgets(every=every), self._roots + len(self._root_levels) > 0)
         self._room = max(len(self.stepped), self._roots + sum(self._root_levels[:1]))
         counts[_WHOLE] = self._whole
         counts[_FLOATING] = self._roots
@@ -2354,7 +2356,7 @@ class StepRunner:
         self._list_roots(roots, root_trees)
         if len(self.stepped) == 0:
             return
-        self._count(steps)
+        self._count(every=True)
         self._counts[_GROUPS] = self._whole_groups
         counts = self._counts.tobytes()
         if self.uploaded != counts or len(self.fast) or len(roots):

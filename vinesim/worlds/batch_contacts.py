@@ -566,8 +566,8 @@ class BatchContacts:
     def forget(self, resets: wp.array) -> KernelLaunch:
         """Returns the launch after which the next step of some worlds begins without contacts. ``resets``: bool
         [world], which worlds."""
-        given = (resets, self._world_contacts, self._warm_start)
-        return self._launch(reset.forget_contacts, self.worlds, *given)
+        before = (self._world_contacts, self._warm_start, self._was_in_contact, self._rigid_bodies)
+        return self._launch(reset.forget_contacts, self.worlds, self.worlds, self._dofs, resets, *before)
 
     def solve(self) -> None:
         """Launch the kernels of the contacts of one step. An argument of :meth:`ArticulationSolver.advance`, which
