@@ -90,6 +90,8 @@ def observe(
         if world_contacts.tree[at] / worlds != wanted:
             force = force + float(wp.length(contacts.force[at]))
     observation_out[world, place] = force
+    for k in range(trees):
+        observation_out[world, place + 1 + k] = wp.where(k == wanted, 1.0, 0.0)
     effort = float(0.0)
     for i in range(action.shape[1]):
         effort = effort + action[world, i] * action[world, i]
