@@ -81,6 +81,7 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         self.worlds = worlds
         self.num_envs = worlds.count
         self.render_mode = None
+        self.num_actions = actions
         self.max_episode_steps = max_episode_steps
         self.arrays = arrays
         self.device = device
@@ -90,7 +91,8 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._action = self.empty(float, actions)
         self._seed = wp.zeros(1, dtype=wp.int32, device=device)
-        self._elapsed = self.empty(wp.int32)
+        self.elapsed = self.empty(wp.int32)
+        """[world] Number of actions of the episode so far, on the device."""
         self._episode = self.empty(wp.int32)
         self._begins = self.empty(wp.bool)
         unused = (self.empty(float), self.empty(wp.bool))
@@ -135,7 +137,7 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
     def _judgements(self, results: _Results) -> list[KernelLaunch]:
         _, last, reward, success, *flags = results
         given = [self.max_episode_steps, self.worlds.faults]
-        written = [self._elapsed, last, reward, success, *flags]
+        written = [self.elapsed, last, reward, success, *flags]
         return [
             *self._observations(last, reward, success),
             KernelLaunch(end_episodes, given, written, threads=self.num_envs),
@@ -152,7 +154,7 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         super().reset(seed=seed)
         self._seed.fill_(int(self.np_random.integers(2**31)))
         self._episode.zero_()
-        self._elapsed.zero_()
+        self.elapsed.zero_()
         self._begins.fill_(True)
         self._begin_again()
         results = self._next_results()
