@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pathlib
+
 import numpy as np
 import warp as wp
 
@@ -11,6 +13,7 @@ from vinesim.kernels.learn.episodes import draw_targets
 from vinesim.learn.arm import AXES, JOINT_LIMIT, TOOL, TOOL_LINK, arm
 from vinesim.learn.shoots import shoots
 from vinesim.learn.task_env import STEPS, TaskEnv, check_options
+from vinesim.learn.variation import Variation, as_variation
 from vinesim.scene.model import Model
 from vinesim.worlds.plants import plants_of_worlds
 from vinesim.worlds.worlds import Worlds
@@ -51,7 +54,8 @@ class ReachEnv(TaskEnv):
         device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
         arrays: ``"numpy"``, ``"torch"`` or ``"warp"``; see :class:`~vinesim.learn.task_env.TaskEnv`, which also
             describes ``info`` and errors.
-        vines_seed: seed of the shoots, which stay the same after a reset.
+        vines_seed: seed of what differs between worlds, which stays the same after a reset.
+        variation: ranges of these numbers, or a TOML file with them.
         max_episode_steps: number of actions after which an episode is truncated.
     """
 
@@ -62,11 +66,13 @@ class ReachEnv(TaskEnv):
         device: str = "cpu",
         arrays: str = "numpy",
         vines_seed: int = 0,
+        variation: Variation | str | pathlib.Path = Variation(),
         max_episode_steps: int = MAX_EPISODE_STEPS,
         render_mode: str | None = None,
     ) -> None:
         check_options(num_envs, arrays, render_mode)
-        variants = [_variant(vines_seed, i) for i in range(min(num_envs, VARIANTS))]
+        variation = as_variation(variation)
+        variants = [_variant(vines_seed, i, variation) for i in range(min(num_envs, VARIANTS))]
         worlds = Worlds(plants_of_worlds(variants, num_envs), num_envs, robots=[arm(BASE, HOME)], device=device)
         self._target = wp.zeros(num_envs, dtype=wp.int32, device=device)
         super().__init__(
@@ -75,6 +81,8 @@ class ReachEnv(TaskEnv):
             2 * len(AXES) + 3 * SHOOTS + 1 + SHOOTS,
             device=device,
             arrays=arrays,
+            variation=variation,
+            rng=np.random.default_rng([vines_seed, VARIANTS]),
             max_episode_steps=max_episode_steps,
             render_mode=render_mode,
         )
@@ -116,11 +124,11 @@ class ReachEnv(TaskEnv):
             self.on_device(robot.v[:joints], wp.int32),
             data.qpos,
             data.qvel,
-            self._action,
+            self._given_action,
             *worlds.contacts.lists(),
         ]
         return [KernelLaunch(kernels.observe, given, [observation, reward, success], threads=self.num_envs)]
 
 
-def _variant(seed: int, number: int) -> Model:
-    return shoots(SHOOTS, np.random.default_rng([seed, number]), DISTANCE)
+def _variant(seed: int, number: int, variation: Variation) -> Model:
+    return shoots(SHOOTS, np.random.default_rng([seed, number]), DISTANCE, variation)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vinesim.core import frames
+from vinesim.learn.variation import Variation
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
@@ -13,33 +14,36 @@ PIECES = 8
 """Number of bodies of a shoot's wood."""
 SPACING = 0.22
 """[m] Mean distance between shoots."""
+DENSITY = 900.0
+"""[kg/m^3] Density of shoots and peduncles. GUESSED."""
 HEIGHT = 0.95
 """[m] Mean height at which shoots grow from their arm."""
 
 
-def shoots(count: int, rng: np.random.Generator, distance: float) -> Model:
+def shoots(count: int, rng: np.random.Generator, distance: float, variation: Variation = Variation()) -> Model:
     """Returns ``count`` shoots that hang towards an arm at the origin, from a row at x = ``distance`` [m].
 
-    Length 0.35 to 0.6 m, thickness at the base 7 to 10 mm, modulus 2 to 6 GPa (canes: docs/plants.md), bunches of 0.2
-    to 0.5 kg on peduncles of 5 to 10 cm. Places and directions are GUESSED.
+    ``variation``: ranges of their numbers. Places and directions are GUESSED.
     """
     side = SPACING * (np.arange(count) - 0.5 * (count - 1))
-    return assemble([_shoot(rng, distance, float(y)) for y in side])
+    return assemble([_shoot(rng, distance, float(y), variation) for y in side])
 
 
-def _shoot(rng: np.random.Generator, distance: float, side: float) -> TreeBuilder:
+def _shoot(rng: np.random.Generator, distance: float, side: float, variation: Variation) -> TreeBuilder:
     low, high = np.array([-0.03, -0.04, -0.08]), np.array([0.03, 0.04, 0.08])
     tree = TreeBuilder(frames.pose(np.array([distance, side, HEIGHT]) + rng.uniform(low, high)))
-    length, radius = rng.uniform(0.35, 0.6), 0.5 * rng.uniform(0.007, 0.01)
-    modulus = rng.uniform(2e9, 6e9)
+    length = rng.uniform(*variation.length)
+    radius = 0.5 * rng.uniform(*variation.thickness)
+    modulus = rng.uniform(*variation.modulus)
+    damping = rng.uniform(*variation.damping)
     towards = np.array([-1.0, rng.uniform(-0.3, 0.3), rng.uniform(-0.2, 0.5)])
-    wood = RodMaterial(modulus, 900.0, 0.02, shear_modulus=0.4 * modulus)
+    wood = RodMaterial(modulus, DENSITY, damping, shear_modulus=0.4 * modulus)
     last = tree.add_rod(-1, length, (radius, 0.7 * radius), wood, PIECES, rest=frames.from_x_axis(towards))[-1]
-    stalk = rng.uniform(0.05, 0.1)
+    stalk = rng.uniform(*variation.peduncle)
     down = frames.from_x_axis(np.array([0.3, 0.0, -1.0]))
-    material = RodMaterial(1e9, 900.0, 0.05, shear_modulus=0.4e9)
+    material = RodMaterial(1e9, DENSITY, 0.05, shear_modulus=0.4e9)
     last = tree.add_rod(last, stalk, (0.002, 0.002), material, 2, organ=Organ.PEDUNCLE, rest=down)[-1]
-    mass = rng.uniform(0.2, 0.5)
+    mass = rng.uniform(*variation.bunch_mass)
     extent = 0.17 * (mass / 0.5) ** (1.0 / 3.0)
     spring = np.asarray(tree.bodies[last]["stiffness"])
     width = 0.25 * extent

@@ -17,7 +17,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from vinesim.kernels.graph import KernelGraph, KernelLaunch
-from vinesim.kernels.learn.episodes import end_episodes
+from vinesim.kernels.learn.episodes import delay_actions, end_episodes, forget_actions
+from vinesim.learn.variation import Variation
 from vinesim.worlds.errors import MissingExtra
 from vinesim.worlds.worlds import Worlds
 
@@ -58,6 +59,8 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         numbers: number of an observation's components.
         device: the device of ``worlds``.
         arrays: one of :data:`ARRAYS`: the library of observations, actions and all other arrays.
+        variation: ranges of frictions and delays of the worlds.
+        rng: draws from these ranges.
         max_episode_steps: number of actions after which an episode is truncated.
 
     Raises :class:`ValueError` for an unknown library or a render mode,
@@ -74,6 +77,8 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         *,
         device: str,
         arrays: str,
+        variation: Variation,
+        rng: np.random.Generator,
         max_episode_steps: int,
         render_mode: str | None,
     ) -> None:
@@ -89,15 +94,22 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (numbers,), np.float32)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self._given_action = self.empty(float, actions)  # the last one; ``_action`` is the one that its delay lets act
         self._action = self.empty(float, actions)
+        self._history = self.empty(float, variation.delay[1] + 1, actions)
+        self._delay = self.on_device(rng.integers(*variation.delay, self.num_envs, endpoint=True), wp.int32)
+        worlds.contacts.friction_scale.assign(rng.uniform(*variation.friction, self.num_envs))
         self._seed = wp.zeros(1, dtype=wp.int32, device=device)
         self.elapsed = self.empty(wp.int32)
         """[world] Number of actions of the episode so far, on the device."""
         self._episode = self.empty(wp.int32)
         self._begins = self.empty(wp.bool)
         unused = (self.empty(float), self.empty(wp.bool))
-        self._move = self._graph(self._moves())
-        self._begin = self._graph(self._beginnings())
+        each = {"threads": self.num_envs, "width": actions}
+        delay = KernelLaunch(delay_actions, [self._delay, self._given_action], [self._history, self._action], **each)
+        forget = KernelLaunch(forget_actions, [self._begins], [self._history], **each)
+        self._move = self._graph([delay, *self._moves()])
+        self._begin = self._graph([forget, *self._beginnings()])
         self._results = [self._results_of(numbers) for _ in range(2)]
         self._judge = [self._graph(self._judgements(results)) for results in self._results]
         self._observe = [self._graph(self._observations(results.observation, *unused)) for results in self._results]
@@ -123,7 +135,8 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
 
     @abc.abstractmethod
     def _moves(self) -> list[KernelLaunch]:
-        """Returns the launches that apply ``_action`` [world, k] to the robots."""
+        """Returns the launches that apply ``_action`` [world, k], which may be an earlier one than the last, to the
+        robots."""
 
     @abc.abstractmethod
     def _observations(self, observation: wp.array, reward: wp.array, success: wp.array) -> list[KernelLaunch]:
@@ -195,12 +208,12 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
 
     def _take(self, actions: Any) -> None:
         if self.arrays == "numpy":
-            self._action.assign(np.asarray(actions, np.float32).reshape(self._action.shape))
+            self._given_action.assign(np.asarray(actions, np.float32).reshape(self._action.shape))
             return
         given = actions if self.arrays == "warp" else wp.from_torch(actions.detach().contiguous(), dtype=float)
         if given.shape != self._action.shape:
             raise ValueError(f"actions of shape {given.shape}: give {self._action.shape}")
-        wp.copy(self._action, given)
+        wp.copy(self._given_action, given)
 
     def _given(self, array: wp.array) -> Any:
         """Returns an array of the wanted library."""

@@ -283,6 +283,8 @@ class BatchContacts:
         self._response = self._allocated(delassus.ResponseRows, dict.fromkeys(("a", "alpha"), worlds * slots), {})
         self._rigid_inverse = self._zeros(wp.float64, worlds * self._dofs or 1, dofs)
         self._was_in_contact = self._zeros(wp.bool, trees)
+        self.friction_scale = wp.ones(worlds, dtype=wp.float64, device=self._device)
+        """[world] Factor of the coefficients of friction of all contacts of the world's plants."""
 
     # ------------------------------------------------------------------ kernels
 
@@ -419,6 +421,7 @@ class BatchContacts:
                 self.slots,
                 self._rigid_count,
                 dofs,
+                self.friction_scale,
                 self._bodies,
                 self._rigid_bodies,
                 self.candidates,

@@ -68,3 +68,40 @@ def draw_targets(
         state = wp.rand_init(seed[0] + episode, world)
         target_out[world] = wp.randi(state, 0, count)
         episode_out[world] = episode + 1
+
+
+@wp.kernel
+def delay_actions(
+    # in
+    delay: wp.array(dtype=wp.int32),
+    action: wp.array2d(dtype=float),
+    # out
+    history_out: wp.array3d(dtype=float),
+    applied_out: wp.array2d(dtype=float),
+):
+    """One thread per component of a world's action. Apply the action that was given ``delay`` [world] actions ago.
+
+    history: [world, age, component] actions so far, the newest first; its length is the longest delay + 1.
+    """
+    world, k = wp.tid()
+    ages = history_out.shape[1]
+    for back in range(1, ages):
+        age = ages - back
+        history_out[world, age, k] = history_out[world, age - 1, k]
+    history_out[world, 0, k] = action[world, k]
+    late = delay[world]
+    applied_out[world, k] = history_out[world, late, k]
+
+
+@wp.kernel
+def forget_actions(
+    # in
+    begins: wp.array(dtype=wp.bool),
+    # out
+    history_out: wp.array3d(dtype=float),
+):
+    """One thread per component of a world's action. Let an episode that begins have had actions of 0 before."""
+    world, k = wp.tid()
+    if begins[world]:
+        for age in range(history_out.shape[1]):
+            history_out[world, age, k] = 0.0

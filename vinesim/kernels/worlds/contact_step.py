@@ -108,6 +108,7 @@ def write_world_rows(
     slots: int,
     rigid_bodies: int,
     dofs: int,
+    friction_scale: wp.array(dtype=wp.float64),
     bodies: PlantBodies,
     rigid: RigidBodies,
     candidates: Candidates,
@@ -119,7 +120,8 @@ def write_world_rows(
 ):
     """One thread per contact slot of a world. Write the three rows of the contact in this slot.
 
-    rigid_bodies, dofs: numbers of MuJoCo bodies and degrees of freedom of a world.
+    rigid_bodies, dofs: numbers of MuJoCo bodies and degrees of freedom of a world. friction_scale: [world] factor of the
+    coefficients of friction.
     """
     world, c = world_and_entry(wp.tid(), slots)
     if world < worlds and c < world_contacts.count[wp.min(world, worlds - 1)]:
@@ -148,6 +150,9 @@ def write_world_rows(
             contacts,
             rows,
         )
+        surface = contacts.surface[c]
+        surface.friction = surface.friction * friction_scale[world]
+        contacts.surface[c] = surface
 
 
 @wp.func
