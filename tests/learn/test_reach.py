@@ -158,6 +158,20 @@ def test_gymnasium_finds_no_fault_in_one_world():
         check_env(gymnasium.make("vinesim/Reach-v0").unwrapped, skip_render_check=True)
 
 
+def test_gymnasiums_wrapper_counts_the_episodes_of_the_worlds():
+    wrapper = gymnasium.wrappers.vector.RecordEpisodeStatistics
+    env = wrapper(gymnasium.make_vec("vinesim/Reach-v0", num_envs=2, max_episode_steps=3))
+    env.reset(seed=1)
+    rewards = []
+    for k in range(3):
+        observation, reward, _, truncated, info = env.step(env.action_space.sample())
+        assert env.observation_space.contains(observation)
+        assert ("episode" in info) == truncated.all() == (k == 2)
+        rewards.append(reward)
+    assert info["episode"]["l"].tolist() == [3, 3]
+    np.testing.assert_allclose(info["episode"]["r"], np.sum(rewards, 0), rtol=1e-5)
+
+
 def test_the_examples_of_the_page_run():
     """The blocks of docs/worlds.md."""
     page = (pathlib.Path(__file__).parents[2] / "docs" / "worlds.md").read_text()
