@@ -10,9 +10,13 @@ import numpy as np
 import pytest
 import warp as wp
 
-gymnasium = pytest.importorskip("gymnasium")
+pytest.importorskip("gymnasium")
 pytest.importorskip("mujoco_warp")
 pytest.importorskip("vinesim.learn")
+import gymnasium
+
+from tests.learn.arm_control import towards
+from vinesim.learn.variation import Variation
 
 pytestmark = pytest.mark.slow
 
@@ -20,29 +24,6 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def environment() -> Any:
     return gymnasium.make_vec("vinesim/Reach-v0", num_envs=3)
-
-
-def towards_bunch(env: Any, observation: np.ndarray) -> np.ndarray:
-    """Returns the action that moves the fingers along the way to the wanted bunch, by the transposed Jacobian."""
-    import mujoco
-
-    bodies = env.unwrapped.worlds.bodies
-    robot = bodies.rigid.robot("arm")
-    m = bodies.rigid.mj_model
-    d = mujoco.MjData(m)
-    actions = []
-    for world, seen in enumerate(observation):
-        d.qpos[:] = bodies.data.qpos.numpy()[world]
-        mujoco.mj_kinematics(m, d)
-        mujoco.mj_comPos(m, d)
-        body = robot.bodies["link_6"]
-        point = d.xpos[body] + d.xmat[body].reshape(3, 3) @ np.array([0.2, 0.0, 0.0])
-        jacobian = np.zeros((3, m.nv))
-        mujoco.mj_jac(m, d, jacobian, None, point, body)
-        J = jacobian[:, robot.v[:7]]
-        way = np.linalg.solve(J @ J.T + 0.01 * np.eye(3), seen[14:17])
-        actions.append(np.clip(8.0 * J.T @ way, -1.0, 1.0))
-    return np.array(actions, np.float32)
 
 
 def test_spaces_and_counts(environment):
@@ -74,7 +55,7 @@ def test_a_simple_controller_reaches_the_bunches(environment):
     observation, _ = environment.reset(seed=2)
     reached = 0
     for _ in range(100):
-        observation, reward, terminated, truncated, info = environment.step(towards_bunch(environment, observation))
+        observation, reward, terminated, truncated, info = environment.step(towards(environment, observation[:, 14:17]))
         for world in np.flatnonzero(info["success"]):
             reached += 1
             assert terminated[world]
@@ -150,12 +131,13 @@ def test_arrays_on_the_device_have_the_numbers_of_those_of_numpy_and_are_no_copi
         on_device.step(wp.zeros((2, 6)))
 
 
-def test_gymnasium_finds_no_fault_in_one_world():
+@pytest.mark.parametrize("task", ["Reach", "Expose"])
+def test_gymnasium_finds_no_fault_in_one_world(task):
     from gymnasium.utils.env_checker import check_env
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the checker advises against observations without bounds
-        check_env(gymnasium.make("vinesim/Reach-v0").unwrapped, skip_render_check=True)
+        check_env(gymnasium.make(f"vinesim/{task}-v0").unwrapped, skip_render_check=True)
 
 
 def test_gymnasiums_wrapper_counts_the_episodes_of_the_worlds():
@@ -188,6 +170,10 @@ def test_bad_arguments_are_named():
         gymnasium.make_vec("vinesim/Reach-v0", num_envs=1, render_mode="rgb_array")
     with pytest.raises(ValueError, match="arrays 'jax': give one of numpy, torch, warp"):
         gymnasium.make_vec("vinesim/Reach-v0", num_envs=1, arrays="jax")
+    with pytest.raises(gymnasium.error.NameNotFound, match="Reach"):
+        gymnasium.make_vec("vinesim/Rech-v0", num_envs=1)
+    with pytest.raises(ValueError, match="shoots tip over"):
+        gymnasium.make_vec("vinesim/Reach-v0", num_envs=1, variation=Variation(modulus=(1e7, 1e7)))
 
 
 @pytest.mark.skipif(importlib.util.find_spec("torch") is not None, reason="PyTorch is installed")

@@ -6,9 +6,12 @@ import numpy as np
 
 from vinesim.core import frames
 from vinesim.learn.variation import Variation
+from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
+from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.scene.state import State
 
 PIECES = 8
 """Number of bodies of a shoot's wood."""
@@ -19,14 +22,46 @@ DENSITY = 900.0
 HEIGHT = 0.95
 """[m] Mean height at which shoots grow from their arm."""
 
+DRAWS = 50
+"""Number of draws after which no stable shoot is expected any more."""
+PUSH = 0.02
+"""[rad/s] Rates of all joints, about each axis, with which a shoot must not tip over."""
+SETTLING = 3.0
+"""[s] Time in which a shoot that tips over goes away."""
+DRIFT = 0.02
+"""[m] Distance that only bunches of shoots that tip over cover in this time."""
+
 
 def shoots(count: int, rng: np.random.Generator, distance: float, variation: Variation = Variation()) -> Model:
     """Returns ``count`` shoots that hang towards an arm at the origin, from a row at x = ``distance`` [m].
 
-    ``variation``: ranges of their numbers. Places and directions are GUESSED.
+    ``variation``: ranges of their numbers. Places and directions are GUESSED. A shoot that would tip over under its
+    bunch is drawn again. Raises :class:`ValueError` if nearly all shoots in the ranges would.
     """
     side = SPACING * (np.arange(count) - 0.5 * (count - 1))
-    return assemble([_shoot(rng, distance, float(y), variation) for y in side])
+    trees = [_shoot(rng, distance, float(y), variation) for y in side]
+    for _ in range(DRAWS):
+        falls = np.flatnonzero(_falls(assemble(trees)))
+        if len(falls) == 0:
+            return assemble(trees)
+        for i in falls:
+            trees[i] = _shoot(rng, distance, float(side[i]), variation)
+    raise ValueError(f"shoots tip over under their bunches in {DRAWS} draws: give a higher modulus or lighter bunches")
+
+
+def _falls(model: Model) -> np.ndarray:
+    """Returns for each tree [tree] whether its bunch goes away from where it hangs at rest, after a light push."""
+    state = State.at_rest(model)
+    plants = ArticulationSolver(model, state, PhysicsParameters(sleep=False))
+    plants.wake(np.arange(len(model.tree_first)))
+    plants.forward_kinematics()
+    before = state.body_q[model.bunch_body, :3].copy()
+    state.joint_qd[:] = PUSH
+    plants.upload()
+    plants.advance(round(SETTLING / plants.dt))
+    plants.download()
+    plants.forward_kinematics()
+    return np.linalg.norm(state.body_q[model.bunch_body, :3] - before, axis=1) > DRIFT
 
 
 def _shoot(rng: np.random.Generator, distance: float, side: float, variation: Variation) -> TreeBuilder:

@@ -593,6 +593,12 @@ class BatchContacts:
         return self.contacts, self._world_contacts
 
     @property
+    def capsules(self) -> structs.Capsules:
+        """Collision capsules of the plants, for kernels. Capsule i of a tree is at ``i * trees + tree``; an entry with
+        the body -1 is no capsule."""
+        return self._capsules
+
+    @property
     def count(self) -> np.ndarray:
         """[world] Number of contacts in the last step, including contacts without force."""
         return self._world_contacts.count.numpy()
