@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.kernels.graph import KernelLaunch
-from vinesim.kernels.learn.reach import move_targets
+from vinesim.kernels.learn.reach import ArmState, move_targets
 from vinesim.learn.arm import AXES, JOINT_LIMIT, TOOL, TOOL_LINK, arm
 from vinesim.learn.task_env import STEPS, TaskEnv, check_options
 from vinesim.learn.variation import Variation, as_variation
@@ -89,13 +89,14 @@ class ArmEnv(TaskEnv):
         given = [SPEED * STEPS * self.worlds.dt, *limits, LEAD, q, self._action, bodies.data.qpos]
         return [KernelLaunch(move_targets, given, [bodies.targets], threads=self.num_envs, width=joints)]
 
-    def _arm_state(self) -> list[Any]:
-        """Returns the arguments of kernels for the arm: body of the tool, the tool's point in its axes, poses of
-        bodies, indices of the joints, and MuJoCo's state."""
+    def _arm_state(self) -> ArmState:
         data = self.worlds.bodies.data
         robot = self.worlds.bodies.rigid.robot("arm")
-        q, v = (self.on_device(index[: len(AXES)], wp.int32) for index in (robot.q, robot.v))
-        return [robot.bodies[TOOL_LINK], wp.vec3(*TOOL), data.xpos, data.xmat, q, v, data.qpos, data.qvel]
+        state = ArmState()
+        state.tool_body, state.tool = robot.bodies[TOOL_LINK], wp.vec3(*TOOL)
+        state.q, state.v = (self.on_device(index[: len(AXES)], wp.int32) for index in (robot.q, robot.v))
+        state.xpos, state.xmat, state.qpos, state.qvel = data.xpos, data.xmat, data.qpos, data.qvel
+        return state
 
     def _bunches(self) -> list[Any]:
         """Returns the arguments of kernels for the bunches [tree]: bodies, centres of mass, and poses of bodies."""

@@ -61,7 +61,7 @@ class ExposeEnv(ArmEnv):
         numbers.success_reward, numbers.force_cost, numbers.action_cost = 10.0, 0.02, 0.01
         given = [
             numbers,
-            *self._arm_state(),
+            self._arm_state(),
             *self._bunches(),
             worlds.plants.launches.resident_arrays["body_qd"],
             self.on_device(np.stack([model.bunch_length, model.bunch_radius], -1), wp.vec2),

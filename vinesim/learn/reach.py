@@ -48,7 +48,7 @@ class ReachEnv(ArmEnv):
         numbers.distance_cost, numbers.force_cost, numbers.action_cost = 1.0, 0.02, 0.01
         given = [
             numbers,
-            *self._arm_state(),
+            self._arm_state(),
             *self._bunches(),
             self.num_envs,
             self._target,

@@ -6,7 +6,7 @@ import warp as wp
 from vinesim.kernels.contact.body_motion import to_double
 from vinesim.kernels.contact.distance import segment_segment_distance
 from vinesim.kernels.contact.structs import Capsules, Contacts
-from vinesim.kernels.learn.reach import bunch_middle
+from vinesim.kernels.learn.reach import ArmState, bunch_middle, observe_arm
 from vinesim.kernels.worlds.narrowphase import WorldContacts
 
 wp.set_module_options({"enable_backward": False})
@@ -62,15 +62,8 @@ def is_hidden(
 def observe(
     # model
     numbers: ExposeNumbers,
-    tool_body: int,
-    tool: wp.vec3,
     # in
-    xpos: wp.array2d(dtype=wp.vec3),
-    xmat: wp.array2d(dtype=wp.mat33),
-    q: wp.array(dtype=wp.int32),
-    v: wp.array(dtype=wp.int32),
-    qpos: wp.array2d(dtype=float),
-    qvel: wp.array2d(dtype=float),
+    arm: ArmState,
     bunch: wp.array(dtype=wp.int32),
     bunch_com: wp.array(dtype=wp.vec3),
     body_q: wp.array(dtype=wp.transform),
@@ -93,13 +86,9 @@ def observe(
     :class:`vinesim.learn.expose.ExposeEnv` describes it.
     """
     world = wp.tid()
-    joints = q.shape[0]
+    joints = arm.q.shape[0]
     trees = bunch.shape[0]
-    for i in range(joints):
-        observation_out[world, i] = qpos[world, q[i]]
-        observation_out[world, joints + i] = qvel[world, v[i]]
-    rotation = xmat[world, tool_body]
-    point = xpos[world, tool_body] + rotation * tool
+    point = observe_arm(world, arm, observation_out)
     place = int(2 * joints)
     for tree in range(world, trees, worlds):
         away = bunch_middle(body_q, bunch[tree], bunch_com[tree]) - point
