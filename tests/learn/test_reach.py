@@ -1,5 +1,6 @@
 """The task reach as a Gymnasium vector environment."""
 
+import importlib.util
 import pathlib
 import re
 import warnings
@@ -7,10 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+import warp as wp
 
-gymnasium = pytest.importorskip("gymnasium")
+pytest.importorskip("gymnasium")
 pytest.importorskip("mujoco_warp")
 pytest.importorskip("vinesim.learn")
+import gymnasium
+
+from tests.learn.arm_control import towards
+from vinesim.learn.variation import Variation
 
 pytestmark = pytest.mark.slow
 
@@ -18,29 +24,6 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def environment() -> Any:
     return gymnasium.make_vec("vinesim/Reach-v0", num_envs=3)
-
-
-def towards_bunch(env: Any, observation: np.ndarray) -> np.ndarray:
-    """Returns the action that moves the fingers along the way to the wanted bunch, by the transposed Jacobian."""
-    import mujoco
-
-    bodies = env.unwrapped.worlds.bodies
-    robot = bodies.rigid.robot("arm")
-    m = bodies.rigid.mj_model
-    d = mujoco.MjData(m)
-    actions = []
-    for world, seen in enumerate(observation):
-        d.qpos[:] = bodies.data.qpos.numpy()[world]
-        mujoco.mj_kinematics(m, d)
-        mujoco.mj_comPos(m, d)
-        body = robot.bodies["link_6"]
-        point = d.xpos[body] + d.xmat[body].reshape(3, 3) @ np.array([0.2, 0.0, 0.0])
-        jacobian = np.zeros((3, m.nv))
-        mujoco.mj_jac(m, d, jacobian, None, point, body)
-        J = jacobian[:, robot.v[:7]]
-        way = np.linalg.solve(J @ J.T + 0.01 * np.eye(3), seen[14:17])
-        actions.append(np.clip(8.0 * J.T @ way, -1.0, 1.0))
-    return np.array(actions, np.float32)
 
 
 def test_spaces_and_counts(environment):
@@ -72,7 +55,7 @@ def test_a_simple_controller_reaches_the_bunches(environment):
     observation, _ = environment.reset(seed=2)
     reached = 0
     for _ in range(100):
-        observation, reward, terminated, truncated, info = environment.step(towards_bunch(environment, observation))
+        observation, reward, terminated, truncated, info = environment.step(towards(environment, observation[:, 14:17]))
         for world in np.flatnonzero(info["success"]):
             reached += 1
             assert terminated[world]
@@ -90,12 +73,85 @@ def test_an_episode_without_success_is_truncated(environment):
     assert [bool(truncated.all()) for _, truncated in ends].index(True) == 99
 
 
-def test_gymnasium_finds_no_fault_in_one_world():
+def test_a_world_that_explodes_ends_with_its_fault_and_the_others_do_not_notice(environment):
+    """NaN among the rates of the arm of the second of three worlds."""
+
+    def run(explode: bool) -> list[list[np.ndarray]]:
+        environment.reset(seed=11)
+        seen = []
+        for k in range(6):
+            if explode and k == 2:
+                qvel = environment.worlds.bodies.data.qvel
+                numbers = qvel.numpy()
+                numbers[1, 4] = np.nan
+                qvel.assign(numbers)
+            *results, info = environment.step(np.full((3, 7), 0.3, np.float32))
+            seen.append([*results, info["fault"]])
+            assert (k == 2 and explode) == ("final_obs" in info)
+        return seen
+
+    sound, broken = run(False), run(True)
+    for one, other in zip(sound, broken, strict=True):
+        for a, b in zip(one, other, strict=True):
+            np.testing.assert_array_equal(a[[0, 2]], b[[0, 2]])
+            assert np.isfinite(b).all()
+    _, reward, terminated, truncated, fault = broken[2]
+    assert fault[1] & 1
+    assert reward[1] == 0.0
+    assert terminated.tolist() == [False, True, False]
+    assert not truncated.any()
+    assert not broken[3][4].any(), "the world has begun again"
+
+
+def test_arrays_on_the_device_have_the_numbers_of_those_of_numpy_and_are_no_copies():
+    """By DLPack, as PyTorch would take them. The results of an action stay until the action after the next one."""
+    on_host, on_device = (gymnasium.make_vec("vinesim/Reach-v0", num_envs=2, arrays=a) for a in ("numpy", "warp"))
+    rng = np.random.default_rng(1)
+    seen = [env.reset(seed=3)[0] for env in (on_host, on_device)]
+    np.testing.assert_array_equal(seen[0], np.from_dlpack(seen[1]))
+    kept, copy = [], []
+    for _ in range(4):
+        action = rng.uniform(-1.0, 1.0, (2, 7)).astype(np.float32)
+        *expected, info = on_host.step(action)
+        *results, on_device_info = on_device.step(wp.array(action, device="cpu"))
+        results += [on_device_info["success"], on_device_info["fault"]]
+        expected += [info["success"], info["fault"]]
+        views = [np.from_dlpack(array) for array in results]
+        for one, other in zip(expected, views, strict=True):
+            np.testing.assert_array_equal(one, other)
+        assert views[0].__array_interface__["data"][0] == results[0].ptr
+        kept.append(views[0])
+        copy.append(views[0].copy())
+        np.testing.assert_array_equal(kept[-1], copy[-1])
+        if len(kept) > 1:
+            np.testing.assert_array_equal(kept[-2], copy[-2])
+    assert kept[0].__array_interface__["data"] == kept[2].__array_interface__["data"]
+    assert (kept[0] != copy[0]).any()
+    with pytest.raises(ValueError, match=r"actions of shape \(2, 6\): give \(2, 7\)"):
+        on_device.step(wp.zeros((2, 6)))
+
+
+@pytest.mark.parametrize("task", ["Reach", "Expose"])
+def test_gymnasium_finds_no_fault_in_one_world(task):
     from gymnasium.utils.env_checker import check_env
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the checker advises against observations without bounds
-        check_env(gymnasium.make("vinesim/Reach-v0").unwrapped, skip_render_check=True)
+        check_env(gymnasium.make(f"vinesim/{task}-v0").unwrapped, skip_render_check=True)
+
+
+def test_gymnasiums_wrapper_counts_the_episodes_of_the_worlds():
+    wrapper = gymnasium.wrappers.vector.RecordEpisodeStatistics
+    env = wrapper(gymnasium.make_vec("vinesim/Reach-v0", num_envs=2, max_episode_steps=3))
+    env.reset(seed=1)
+    rewards = []
+    for k in range(3):
+        observation, reward, _, truncated, info = env.step(env.action_space.sample())
+        assert env.observation_space.contains(observation)
+        assert ("episode" in info) == truncated.all() == (k == 2)
+        rewards.append(reward)
+    assert info["episode"]["l"].tolist() == [3, 3]
+    np.testing.assert_allclose(info["episode"]["r"], np.sum(rewards, 0), rtol=1e-5)
 
 
 def test_the_examples_of_the_page_run():
@@ -112,3 +168,15 @@ def test_bad_arguments_are_named():
         gymnasium.make_vec("vinesim/Reach-v0", num_envs=0)
     with pytest.raises(ValueError, match="render_mode"):
         gymnasium.make_vec("vinesim/Reach-v0", num_envs=1, render_mode="rgb_array")
+    with pytest.raises(ValueError, match="arrays 'jax': give one of numpy, torch, warp"):
+        gymnasium.make_vec("vinesim/Reach-v0", num_envs=1, arrays="jax")
+    with pytest.raises(gymnasium.error.NameNotFound, match="Reach"):
+        gymnasium.make_vec("vinesim/Rech-v0", num_envs=1)
+    with pytest.raises(ValueError, match="shoots tip over"):
+        gymnasium.make_vec("vinesim/Reach-v0", num_envs=1, variation=Variation(modulus=(1e7, 1e7)))
+
+
+@pytest.mark.skipif(importlib.util.find_spec("torch") is not None, reason="PyTorch is installed")
+def test_without_pytorch_the_message_says_what_to_install():
+    with pytest.raises(ImportError, match="pip install torch"):
+        gymnasium.make_vec("vinesim/Reach-v0", num_envs=1, arrays="torch")

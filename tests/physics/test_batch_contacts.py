@@ -93,6 +93,30 @@ def test_trees_move_and_press_as_in_a_scene(interleave: int) -> None:
     assert assert_as_in_a_scene(canes(3), interleave) == {"fixed/0", "fixed/1"}
 
 
+def test_arrays_of_trees_are_copied_to_the_device_only_after_an_upload(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Backward Euler steps begin with the next upload."""
+    (still, _), (plants, _) = resident(canes(3), 2), resident(canes(3), 2)
+    copies = []
+    upload = plants.launches.upload_trees
+    monkeypatch.setattr(plants.launches, "upload_trees", lambda: copies.append(upload()))
+
+    def difference() -> float:
+        for solver in (still, plants):
+            solver.advance(2)
+            solver.download()
+        return float(np.abs(plants.state.joint_q - still.state.joint_q).max())
+
+    still.upload()
+    plants.upload()
+    assert difference() == difference() == difference() == 0.0
+    assert len(copies) == 1
+    plants.use_backward_euler(np.arange(3))
+    plants.upload()
+    still.upload()
+    assert difference() > 1e-6
+    assert len(copies) == 2
+
+
 WEDGE = [
     (x, y, z) for y in (-0.5, 0.5) for x, z in ((-0.04, -0.03), (0.04, -0.03), (-0.04, 0.0), (0.04, 0.0), (0.0, 0.03))
 ]

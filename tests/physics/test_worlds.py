@@ -1,9 +1,12 @@
 """Batches of worlds with robots: as the physics of a client, world by world."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from vinesim.bench import scenes
+from vinesim.kernels.worlds.reset import MOTION, ROOM
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.world import Physics
@@ -76,6 +79,105 @@ def test_a_world_that_is_reset_repeats_its_steps_to_the_bit_and_the_other_goes_o
     again = run(0, 60)
     np.testing.assert_array_equal(again[0], begin[0])
     assert np.abs(again[1] - begin[1]).max() > 1e-3
+
+
+def put(array: str, world: int, value: float) -> Callable[[Worlds], None]:
+    """Returns a function that overwrites numbers of the robot's or the plants' state of one world of four."""
+
+    def overwrite(worlds: Worlds) -> None:
+        if array in ("qpos", "qvel"):
+            rows = getattr(worlds.bodies.data, array)
+            numbers = rows.numpy()
+            numbers[world, 1] = value
+        else:
+            rows = worlds.plants.launches.resident_arrays[array]
+            numbers = rows.numpy()
+            size = len(numbers) // 4
+            numbers[world * size : (world + 1) * size] = value
+        rows.assign(numbers)
+
+    return overwrite
+
+
+@pytest.fixture(scope="module")
+def four() -> Worlds:
+    return Worlds(bunches(4), 4, robots=[HAND], parameters=PARAMETERS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "explode",
+    [
+        pytest.param(put("qvel", 1, np.nan), id="robot's rate"),
+        pytest.param(put("qpos", 1, np.nan), id="robot's position"),
+        pytest.param(put("qvel", 1, 1e7), id="robot too fast"),
+        pytest.param(put("joint_qd", 1, np.nan), id="plants' rates"),
+        pytest.param(put("joint_q", 1, np.nan), id="plants' positions"),
+        pytest.param(put("joint_qd", 1, 1e6), id="plants too fast"),
+    ],
+)
+def test_a_world_that_explodes_is_found_and_reset_and_the_others_do_not_notice(
+    four: Worlds, explode: Callable[[Worlds], None]
+) -> None:
+    """The hands hold their bunches when one of four worlds explodes."""
+    worlds = four
+
+    def run(first: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+        for tick in range(first, first + count, 2):
+            worlds.bodies.targets.assign(np.array([targets(tick, 0.1)] * 4, np.float32))
+            worlds.step(2)
+        worlds.download()
+        return worlds.plants.state.joint_q.reshape(4, -1, 4).copy(), worlds.bodies.data.qpos.numpy()
+
+    worlds.reset()
+    run(0, 40)
+    assert (worlds.contacts.count > 0).all()
+    sound = run(40, 8)
+    worlds.reset()
+    assert not worlds.faults.numpy().any()
+    counted = worlds.fault_count.numpy().copy()
+    run(0, 40)
+    explode(worlds)
+    broken = run(40, 8)
+    assert (worlds.faults.numpy() & MOTION).tolist() == [0, MOTION, 0, 0]
+    assert not worlds.faults.numpy()[[0, 2, 3]].any()
+    assert (worlds.fault_count.numpy() - counted).tolist() == [0, 1, 0, 0]
+    for one, other in zip(sound, broken, strict=True):
+        np.testing.assert_array_equal(other[[0, 2, 3]], one[[0, 2, 3]])
+    worlds.reset(worlds.faults.numpy() != 0)
+    assert not worlds.faults.numpy().any()
+    run(0, 40)
+    again = run(40, 8)
+    for one, other in zip(sound, again, strict=True):
+        np.testing.assert_array_equal(other[1], one[1])
+    assert not worlds.faults.numpy().any()
+
+
+@pytest.mark.slow
+def test_contacts_beyond_the_room_of_one_world_are_its_fault_alone() -> None:
+    """The second hand closes both fingers where there is room for one contact; the other hands close one. Its
+    first touch is at one point."""
+
+    def run(both: bool) -> Worlds:
+        worlds = Worlds(bunches(4), 4, robots=[HAND], parameters=PARAMETERS, slots=1)
+        for tick in range(23):
+            close = np.array([targets(tick, 0.0)] * 4, np.float32)
+            close[[0, 2, 3] if both else slice(None), 2] = 0.0
+            worlds.bodies.targets.assign(close)
+            worlds.step()
+        worlds.download()
+        return worlds
+
+    sound, crowded = run(False), run(True)
+    assert (sound.contacts.count == 1).all()
+    assert not sound.faults.numpy().any()
+    assert crowded.faults.numpy().tolist() == [0, ROOM, 0, 0]
+    assert crowded.fault_count.numpy().tolist() == [0, 1, 0, 0]
+    one, other = (worlds.plants.state.joint_q.reshape(4, -1, 4) for worlds in (sound, crowded))
+    np.testing.assert_array_equal(other[[0, 2, 3]], one[[0, 2, 3]])
+    crowded.reset(np.array([False, True, False, False]))
+    crowded.step()
+    assert crowded.faults.numpy()[1] == 0, "only a further contact without room is a new fault"
 
 
 def test_plants_of_worlds_are_those_of_their_models():

@@ -11,8 +11,9 @@ try:
 except ImportError as error:
     raise MissingExtra(f"vinesim.learn needs gymnasium: pip install 'vinesim[learn]' ({error})") from error
 
-gymnasium.register(
-    "vinesim/Reach-v0",
-    entry_point="vinesim.learn.one_world:ReachOne",
-    vector_entry_point="vinesim.learn.reach:ReachEnv",
-)
+for _task in ("Reach", "Expose"):
+    gymnasium.register(
+        f"vinesim/{_task}-v0",
+        entry_point=f"vinesim.learn.one_world:{_task}One",
+        vector_entry_point=f"vinesim.learn.{_task.lower()}:{_task}Env",
+    )

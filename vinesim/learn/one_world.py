@@ -1,4 +1,4 @@
-"""A vector environment with one world as an environment, for libraries that want those."""
+"""Vector environments with one world as environments, for libraries that want those."""
 
 from __future__ import annotations
 
@@ -7,16 +7,18 @@ from typing import Any, ClassVar
 import gymnasium
 import numpy as np
 
+from vinesim.learn.expose import ExposeEnv
 from vinesim.learn.reach import ReachEnv
+from vinesim.learn.task_env import TaskEnv
 
 
-class ReachOne(gymnasium.Env[np.ndarray, np.ndarray]):
-    """:class:`ReachEnv` with one world. ``options``: arguments of :class:`ReachEnv` except ``num_envs``."""
+class OneWorld(gymnasium.Env[np.ndarray, np.ndarray]):
+    """A task with one world. ``vector``: the task, with arrays of NumPy."""
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
 
-    def __init__(self, **options: Any) -> None:
-        self.vector = ReachEnv(1, **options)
+    def __init__(self, vector: TaskEnv) -> None:
+        self.vector = vector
         self.action_space = self.vector.single_action_space
         self.observation_space = self.vector.single_observation_space
         self.render_mode = None
@@ -34,3 +36,18 @@ class ReachOne(gymnasium.Env[np.ndarray, np.ndarray]):
         observation, reward, terminated, truncated, info = self.vector.step(np.asarray(action)[None])
         seen = info.get("final_obs", observation)[0]
         return seen, float(reward[0]), bool(terminated[0]), bool(truncated[0]), {"success": bool(info["success"][0])}
+
+
+class ReachOne(OneWorld):
+    """:class:`ReachEnv` with one world. ``options``: arguments of :class:`ReachEnv` except ``num_envs``, ``arrays``."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(ReachEnv(1, **options))
+
+
+class ExposeOne(OneWorld):
+    """:class:`ExposeEnv` with one world. ``options``: arguments of :class:`ExposeEnv` except ``num_envs``,
+    ``arrays``."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(ExposeEnv(1, **options))

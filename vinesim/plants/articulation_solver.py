@@ -671,10 +671,10 @@ class ArticulationSolver:
         """Take many steps of the awake trees without sleep and fault guard. ``between`` launches the kernels that run
         between prediction and integration, such as contacts.
 
-        A GPU works on its own copies of all arrays: call :meth:`upload` before and :meth:`download` after. During the
-        steps nothing is copied between host and GPU. Afterwards ``velocity_free`` and ``acceleration`` hold the values
-        of the last step. A tree whose motion became invalid (``tree_rate`` NaN or above ``fault_rate``) keeps its last
-        valid pose.
+        A GPU works on its own copies of all arrays: call :meth:`upload` after each change of an array on the host, and
+        :meth:`download` after the steps. During the steps nothing is copied between host and GPU. Afterwards
+        ``velocity_free`` and ``acceleration`` hold the values of the last step. A tree whose motion became invalid
+        (``tree_rate`` NaN or above ``fault_rate``) keeps its last valid pose.
         """
         self._runner.list_trees(self._awake)
         floating = self._floating_roots()
@@ -691,6 +691,7 @@ class ArticulationSolver:
     def upload(self) -> None:
         """Copy the host's arrays of the awake trees to the device; on a CPU there is nothing to copy."""
         self._runner.list_trees(self._awake)
+        self._runner.uploaded = None
         self.launches.upload_step(len(self._runner.stepped))
         self.buffers.synchronize()
 
@@ -1472,8 +1473,8 @@ class KernelLaunches:
     them. The model's rows are copied by :meth:`upload_changed` when :attr:`changed` is set. A GPU reads all other
     arrays in the host's memory. In a sequence of many steps (:meth:`ArticulationSolver.advance`) these reads would take
     longer than the steps. So for such a sequence the GPU also has copies of :data:`TREE_INPUTS`, and separate launches
-    that use them (:attr:`resident`). The sequence begins with :meth:`upload_trees` and ends with
-    :meth:`download_trees`.
+    that use them (:attr:`resident`). The sequence begins with :meth:`upload_trees` if the host may have changed an
+    array, and ends with :meth:`download_trees`.
     """
 
     def __init__(self, solver: ArticulationSolver, parameters: dict[str, float], max_substeps: int) -> None:
@@ -1889,13 +1890,14 @@ class KernelLaunches:
         kind, phi = (self.buffers.host[name][trees] for name in ("tree_budget", "tree_phi"))
         self._watches_closely = bool(((kind == CLOSELY) | (phi < MIN_PHI)).any())
 
-    def keeps_budgets(self, steps: int = 1) -> bool:
-        """Returns whether the next ``steps`` steps keep energy budgets. Call it once before their integrations.
+    def keeps_budgets(self, *, every: bool = False) -> bool:
+        """Returns whether the next steps keep energy budgets. Call it once before their integrations.
 
-        On a GPU, and with more than one step, all steps keep budgets. Otherwise one step in :data:`BUDGET_PERIOD` keeps
-        budgets. If a tree is watched closely after that step, all steps up to the next such step keep budgets, too.
+        On a GPU, and if ``every`` step shall, all steps keep budgets, so that no tree depends on others. Otherwise one
+        step in :data:`BUDGET_PERIOD` keeps budgets. If a tree is watched closely after that step, all steps up to the
+        next such step keep budgets, too.
         """
-        self._budget_phase = (self._budget_phase + 1) % BUDGET_PERIOD if steps == 1 else 0
+        self._budget_phase = 0 if every else (self._budget_phase + 1) % BUDGET_PERIOD
         if self._budget_phase == 0 or self.buffers.device.is_cuda:
             self._keeps_budgets = len(self._budgeted) > 0
         elif self._budget_phase == 1 and self._keeps_budgets:
@@ -2219,6 +2221,9 @@ class StepRunner:
         """[k] Number of substeps of each tree of :attr:`fast` when the list was last sorted."""
         self._graph: wp.Graph | None = None
         self._graph_of: tuple = ()
+        self.uploaded: bytes | None = None
+        """The counts with which :meth:`advance` last uploaded arrays of trees. None: the host may have changed an array
+        since."""
         self._topologies = topologies
         self._starts = np.zeros(1, np.int32)
         """Index in the list at which each group begins; the last entry is the length of the list."""
@@ -2250,6 +2255,7 @@ class StepRunner:
 
     def _order(self) -> None:
         """Sort the list of trees by the number of substeps of each tree in ``_steps_of``."""
+        self.uploaded = None
         trees = self.stepped
         on_cpu = self._buffers.device.is_cpu
         topologies = self._topologies.of(trees)
@@ -2294,10 +2300,11 @@ class StepRunner:
         self._lists["floating"][: self._roots] = roots[: self._roots]
         self._lists["divided_floating"][: len(roots) - self._roots] = roots[self._roots :]
 
-    def _count(self, steps: int = 1) -> None:
-        """Write the number of entries of each list that the kernels of the integrations process."""
+    def _count(self, *, every: bool = False) -> None:
+        """Write the number of entries of each list that the kernels of the integrations process. ``every``: see
+        :meth:`KernelLaunches.keeps_budgets`."""
         counts = self._counts
-        self._kind = (self._launches.keeps_budgets(steps), self._roots + len(self._root_levels) > 0)
+        self._kind = (self._launches.keeps_budgets(every=every), self._roots + len(self._root_levels) > 0)
         self._room = max(len(self.stepped), self._roots + sum(self._root_levels[:1]))
         counts[_WHOLE] = self._whole
         counts[_FLOATING] = self._roots
@@ -2313,6 +2320,7 @@ class StepRunner:
 
     def predict(self) -> None:
         """Predict the listed trees over the whole step."""
+        self.uploaded = None
         if len(self.fast):
             self._steps_of[self.fast] = 1
         groups = len(self._starts) - 1
@@ -2348,9 +2356,12 @@ class StepRunner:
         self._list_roots(roots, root_trees)
         if len(self.stepped) == 0:
             return
-        self._count(steps)
+        self._count(every=True)
         self._counts[_GROUPS] = self._whole_groups
-        self._launches.upload_trees()
+        counts = self._counts.tobytes()
+        if self.uploaded != counts or len(self.fast) or len(roots):
+            self._launches.upload_trees()
+            self.uploaded = counts
         if not self._buffers.device.is_cpu:
             what = (self._whole_groups, self._room, len(self._levels), self._kind, between)
             if self._graph is None or self._graph_of != what:

@@ -283,6 +283,8 @@ class BatchContacts:
         self._response = self._allocated(delassus.ResponseRows, dict.fromkeys(("a", "alpha"), worlds * slots), {})
         self._rigid_inverse = self._zeros(wp.float64, worlds * self._dofs or 1, dofs)
         self._was_in_contact = self._zeros(wp.bool, trees)
+        self.friction_scale = wp.ones(worlds, dtype=wp.float64, device=self._device)
+        """[world] Factor of the coefficients of friction of all contacts of the world's plants."""
 
     # ------------------------------------------------------------------ kernels
 
@@ -419,6 +421,7 @@ class BatchContacts:
                 self.slots,
                 self._rigid_count,
                 dofs,
+                self.friction_scale,
                 self._bodies,
                 self._rigid_bodies,
                 self.candidates,
@@ -553,8 +556,12 @@ class BatchContacts:
                     worlds,
                     self._dofs,
                     self.rows,
+                    self.contacts,
+                    self._geoms.count,
                     contacts,
+                    self.bodies.data.qacc,
                     self.bodies.applied,
+                    self.bodies.likely_acceleration,
                 )
             )
         return launches
@@ -562,8 +569,8 @@ class BatchContacts:
     def forget(self, resets: wp.array) -> KernelLaunch:
         """Returns the launch after which the next step of some worlds begins without contacts. ``resets``: bool
         [world], which worlds."""
-        given = (resets, self._world_contacts, self._warm_start)
-        return self._launch(reset.forget_contacts, self.worlds, *given)
+        before = (self._world_contacts, self._warm_start, self._was_in_contact, self._rigid_bodies)
+        return self._launch(reset.forget_contacts, self.worlds, self.worlds, self._dofs, resets, *before)
 
     def solve(self) -> None:
         """Launch the kernels of the contacts of one step. An argument of :meth:`ArticulationSolver.advance`, which
@@ -584,6 +591,12 @@ class BatchContacts:
     def lists(self) -> tuple[structs.Contacts, narrowphase.WorldContacts]:
         """Returns the contacts of the last step, for kernels: entry i of a world is at ``i * worlds + world``."""
         return self.contacts, self._world_contacts
+
+    @property
+    def capsules(self) -> structs.Capsules:
+        """Collision capsules of the plants, for kernels. Capsule i of a tree is at ``i * trees + tree``; an entry with
+        the body -1 is no capsule."""
+        return self._capsules
 
     @property
     def count(self) -> np.ndarray:

@@ -29,16 +29,16 @@ def plants_of_worlds(models: Sequence[Model], count: int) -> Model:
         other = len(models[odd[0]].tree_first)
         raise ValueError(f"model {odd[0]} has {other} trees, model 0 has {trees}: all worlds need as many trees")
     first = np.cumsum([0, *(len(model.tree_first) for model in models[:-1])])
-    return _gathered(_joined(models), (np.arange(trees)[:, None] + first[np.arange(count) % len(models)]).ravel())
+    return _gathered(joined(models), (np.arange(trees)[:, None] + first[np.arange(count) % len(models)]).ravel())
 
 
-def _joined(models: Sequence[Model]) -> Model:
+def joined(models: Sequence[Model]) -> Model:
     """Returns one model with the trees of all models, in their order."""
     counts = {
         kind: sum(model.counts()[kind] for model in models) if kind not in _STANDING else models[0].counts()[kind]
         for kind in models[0].counts()
     }
-    joined = Model.allocate(**counts)
+    whole = Model.allocate(**counts)
     start = dict.fromkeys(counts, 0)
     for model in models:
         added = model.counts()
@@ -52,11 +52,11 @@ def _joined(models: Sequence[Model]) -> Model:
                 value = np.where(value >= 0, value + start["body"], value)
             elif name == "body_tree":
                 value = value + start["tree"]
-            getattr(joined, name)[here] = value
+            getattr(whole, name)[here] = value
         for kind in start:
             start[kind] += added[kind]
-    _take_standing(models[0], joined)
-    return joined
+    _take_standing(models[0], whole)
+    return whole
 
 
 def _gathered(pool: Model, trees: np.ndarray) -> Model:

@@ -38,6 +38,13 @@ def _mujoco_warp() -> Any:
     return mujoco_warp
 
 
+def _turn_free_bodies(model: Any, data: Any) -> None:
+    """Launch the gyroscopic terms of free bodies, as the steps of mujoco_warp do. It has no public function for it."""
+    from mujoco_warp._src.forward import _launch_discrete_free_gyro
+
+    _launch_discrete_free_gyro(model, data, data.qacc, data.qacc, False)
+
+
 class RigidBatch:
     """Robots and boxes of ``count`` worlds on one device, each in the state that ``rigid`` has now.
 
@@ -60,23 +67,36 @@ class RigidBatch:
         limits = int(m.jnt_limited.sum() + m.neq * ROWS_PER_CONTACT + (m.dof_frictionloss > 0.0).sum())
         with wp.ScopedDevice(self.device):
             self.model = self._mjw.put_model(m)
+            # Newton's method finds the acceleration without constraints, too; its own solver takes longer than a step
+            self.model.opt.run_qacc_smooth = False
             self.data = self._mjw.put_data(
                 m, rigid.mj_data, nworld=count, nconmax=contacts, njmax=limits + ROWS_PER_CONTACT * contacts
             )
         self._dt = float(m.opt.timestep)
         controls = self._drives()
         clear = ForeignLaunches(self.applied.zero_)
-        forward, step2 = self._mjw.forward, self._mjw.step2
+        forward = self._mjw.forward
         # a graph takes a CPU 0.5 ms where the calls take 75 ms, because Warp packs the arguments of each launch
         self.predict = KernelGraph(
             controls, clear, ForeignLaunches(lambda: forward(self.model, self.data)), device=device
         )
         """Launches the first half of a step."""
-        self.integrate = KernelGraph(ForeignLaunches(lambda: step2(self.model, self.data)), device=device)
-        """Launches the second half of a step, with the generalised forces in :attr:`applied`."""
+        self.integrate = KernelGraph(ForeignLaunches(self._solve_again), device=device)
+        """Launches the second half of a step, with the generalised forces in :attr:`applied`. The search for the
+        acceleration begins at :attr:`likely_acceleration`."""
         kinematics = self._mjw.kinematics
         self.update_kinematics = KernelGraph(ForeignLaunches(lambda: kinematics(self.model, self.data)), device=device)
         """Computes the poses of all bodies after a step or a reset; a step leaves those of its start."""
+
+    def _solve_again(self) -> None:
+        """Launch what mujoco_warp's step2 does after its stage of actuation, and without sensors.
+
+        The stage of actuation must not run twice, because it makes all constraints stiffer each time.
+        """
+        self._mjw.fwd_acceleration(self.model, self.data)
+        self._mjw.solve(self.model, self.data)
+        _turn_free_bodies(self.model, self.data)
+        self._mjw.discrete(self.model, self.data)
 
     def _drives(self) -> KernelLaunch:
         """Collect the drives of all robots, with a target for each world. Returns the launch that applies them."""
@@ -123,6 +143,11 @@ class RigidBatch:
         """[world, dof] N or N m: generalised forces of the contacts with plants."""
         return self.data.qfrc_applied
 
+    @property
+    def likely_acceleration(self) -> wp.array:
+        """[world, dof] m/s^2 or rad/s^2: where the search of :attr:`integrate` begins. Write it before each call."""
+        return self.data.qacc_warmstart
+
     def state_arrays(self) -> list[wp.array]:
         """Returns the arrays [world, k] of single-precision numbers that are the state of robots and boxes."""
         data = self.data
@@ -143,6 +168,9 @@ class RigidBatch:
         made.row_count = self.model.M_rownnz
         made.column = self.model.M_colind
         made.nefc = self.data.nefc
+        made.J_rownnz = self.data.efc.J_rownnz
+        made.J_rowadr = self.data.efc.J_rowadr
+        made.J_colind = self.data.efc.J_colind
         made.J = self.data.efc.J
         made.D = self.data.efc.D
         made.state = self.data.efc.state

@@ -16,14 +16,14 @@ import numpy as np
 import warp as wp
 
 from vinesim.kernels.graph import KernelGraph, KernelLaunch
-from vinesim.kernels.worlds.reset import restore_bodies, restore_worlds
-from vinesim.plants.articulation_solver import ArticulationSolver
-from vinesim.rigid.rigid_world import RigidWorld
+from vinesim.kernels.worlds.reset import find_faults, forget_faults, restore_rows, restore_worlds
+from vinesim.plants.articulation_solver import TREE_RESULTS, ArticulationSolver
+from vinesim.rigid.rigid_world import MAX_RATE, RigidWorld
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
 from vinesim.scene.values import RobotSpec
-from vinesim.worlds.batch_contacts import BatchContacts
+from vinesim.worlds.batch_contacts import FULL_BLOCK, BatchContacts
 from vinesim.worlds.rigid_batch import RigidBatch
 
 DEFAULT_SLOTS = 16
@@ -32,8 +32,15 @@ _BODY_STATE = ("joint_q", "joint_qd", "body_q", "body_qd", "body_qd_free", "body
 """Arrays with a row for each body that change in a step and that the next step reads."""
 
 
+_BUDGET_STATE = ("limit", "last", "scale", "held", "watch", "mark")
+"""Arrays of energy budgets with an element for each tree that change in a step and that the next step reads."""
+
+
 def _as_table(rows: wp.array) -> wp.array:
-    """Returns an array of vectors, quaternions or poses as a table of numbers that shares its memory."""
+    """Returns an array of numbers of four bytes, vectors, quaternions or poses as a table that shares its memory.
+
+    Integers appear as floating-point numbers with the same bits, which is enough for copies.
+    """
     width = rows.strides[0] // 4
     return wp.array(ptr=rows.ptr, shape=(len(rows), width), dtype=float, device=rows.device)
 
@@ -82,22 +89,49 @@ class Worlds:
         """Contacts of the plants."""
         self.plants.upload()
         self._resets = wp.zeros(count, dtype=wp.bool, device=device)
+        self.faults = wp.zeros(count, dtype=wp.int32, device=device)
+        """[world] What has gone wrong since the world's last reset: a sum of
+        :data:`~vinesim.kernels.worlds.reset.MOTION` (a number is not finite, or a rate too high) and
+        :data:`~vinesim.kernels.worlds.reset.ROOM` (contacts were left out). 0: nothing. A world with a fault goes on
+        as it can, until it is reset."""
+        self.fault_count = wp.zeros(count, dtype=wp.int32, device=device)
+        """[world] Number of times since the start that a world without faults got one."""
+        self._check = self._check_graph(device)
         self._reset = self._reset_graph(device)
 
     def _reset_graph(self, device: str) -> KernelGraph:
         """Returns the launches that return worlds to the states that they have now."""
-        arrays = self.plants.launches.resident_arrays
+        plants = self.plants.launches
+        arrays = plants.resident_arrays
+        trees = wp.array(np.arange(len(self.model.tree_first)), dtype=wp.int32, device=device)
+        of_trees = [arrays[name] for name in TREE_RESULTS] + [getattr(plants.budget, name) for name in _BUDGET_STATE]
+        state = [(array, trees) for array in of_trees]
+        state += [(arrays[name], arrays["body_tree"]) for name in _BODY_STATE]
         launches = []
-        for name in _BODY_STATE:
-            rows = _as_table(arrays[name])
-            given = [self.count, self._resets, arrays["body_tree"], wp.clone(rows)]
-            launches.append(KernelLaunch(restore_bodies, given, [rows], threads=rows.shape[0], width=rows.shape[1]))
+        for array, tree in state:
+            rows = _as_table(array)
+            given = [self.count, self._resets, tree, wp.clone(rows)]
+            launches.append(KernelLaunch(restore_rows, given, [rows], threads=rows.shape[0], width=rows.shape[1]))
         bodies = self.bodies
         for rows in (*bodies.state_arrays(), bodies.targets, bodies.base_velocity, bodies.base_targets):
             if rows.size:
                 given = [self._resets, wp.clone(rows)]
                 launches.append(KernelLaunch(restore_worlds, given, [rows], threads=self.count, width=rows.shape[1]))
-        return KernelGraph(*launches, self.contacts.forget(self._resets), device=device)
+        clear = KernelLaunch(
+            forget_faults, [self._resets], [bodies.data.overflow, self.faults], threads=self.count, block=FULL_BLOCK
+        )
+        return KernelGraph(*launches, self.contacts.forget(self._resets), clear, device=device)
+
+    def _check_graph(self, device: str) -> KernelGraph:
+        """Returns the launch that looks for faults after a step."""
+        data = self.bodies.data
+        rate = self.plants.launches.resident_arrays["tree_rate"]
+        limits = [MAX_RATE, self.plants.fault_rate]
+        state = [self.count, rate, data.qpos, data.qvel, data.overflow, self.contacts.lists()[1]]
+        found = [wp.zeros_like(self.faults), self.faults, self.fault_count]
+        return KernelGraph(
+            KernelLaunch(find_faults, limits + state, found, threads=self.count, block=FULL_BLOCK), device=device
+        )
 
     def reset(self, worlds: np.ndarray | wp.array | None = None) -> None:
         """Return worlds to their first states, with the targets that their robots had then.
@@ -128,9 +162,11 @@ class Worlds:
     def step(self, steps: int = 1) -> None:
         """Advance all worlds by ``steps`` steps."""
         self.plants.advance(steps, self._between)
+        self._check()
 
     def _between(self) -> None:
         """Launch what happens between the prediction and the integration of the plants."""
+        self._check()  # of the step before
         self.bodies.predict()
         self.contacts.solve()
         self.bodies.integrate()

@@ -22,6 +22,36 @@ class ReachNumbers:
     action_cost: float
 
 
+@wp.struct
+class ArmState:
+    """The arm of all worlds."""
+
+    tool_body: int
+    """MuJoCo body of the tool."""
+    tool: wp.vec3
+    """[m] The tool's point in the axes of its body."""
+    q: wp.array(dtype=wp.int32)
+    """[joint] Index in MuJoCo's qpos."""
+    v: wp.array(dtype=wp.int32)
+    """[joint] Index in MuJoCo's qvel."""
+    xpos: wp.array2d(dtype=wp.vec3)
+    """[world, body] m."""
+    xmat: wp.array2d(dtype=wp.mat33)
+    qpos: wp.array2d(dtype=float)
+    qvel: wp.array2d(dtype=float)
+
+
+@wp.func
+def observe_arm(world: int, arm: ArmState, observation_out: wp.array2d(dtype=float)):
+    """Write the positions of the joints, then their rates, into the first entries of an observation. Returns the tool's
+    point [m]."""
+    joints = arm.q.shape[0]
+    for i in range(joints):
+        observation_out[world, i] = arm.qpos[world, arm.q[i]]
+        observation_out[world, joints + i] = arm.qvel[world, arm.v[i]]
+    return arm.xpos[world, arm.tool_body] + arm.xmat[world, arm.tool_body] * arm.tool
+
+
 @wp.func
 def bunch_middle(body_q: wp.array(dtype=wp.transform), body: int, com: wp.vec3):
     """Returns the centre of mass [m] of a bunch in the world."""
@@ -32,20 +62,13 @@ def bunch_middle(body_q: wp.array(dtype=wp.transform), body: int, com: wp.vec3):
 def observe(
     # model
     numbers: ReachNumbers,
-    tool_body: int,
-    tool: wp.vec3,
+    # in
+    arm: ArmState,
     bunch: wp.array(dtype=wp.int32),
     bunch_com: wp.array(dtype=wp.vec3),
-    # in
+    body_q: wp.array(dtype=wp.transform),
     worlds: int,
     target: wp.array(dtype=wp.int32),
-    body_q: wp.array(dtype=wp.transform),
-    xpos: wp.array2d(dtype=wp.vec3),
-    xmat: wp.array2d(dtype=wp.mat33),
-    q: wp.array(dtype=wp.int32),
-    v: wp.array(dtype=wp.int32),
-    qpos: wp.array2d(dtype=float),
-    qvel: wp.array2d(dtype=float),
     action: wp.array2d(dtype=float),
     contacts: Contacts,
     world_contacts: WorldContacts,
@@ -56,19 +79,14 @@ def observe(
 ):
     """One thread per world.
 
-    tool_body, tool: MuJoCo body of the tool, and the tool's point in its axes [m]. bunch, bunch_com: [tree] body of the
-    tree's bunch, and its centre of mass. target: [world] number of the tree whose bunch is wanted, in its world. q, v:
-    [joint] indices in MuJoCo's qpos and qvel. observation: [world, k], as :class:`vinesim.learn.reach.ReachEnv`
+    bunch, bunch_com: [tree] body of the tree's bunch, and its centre of mass. target: [world] number of the tree whose
+    bunch is wanted, in its world. observation: [world, k], as :class:`vinesim.learn.reach.ReachEnv`
     describes it.
     """
     world = wp.tid()
-    joints = q.shape[0]
+    joints = arm.q.shape[0]
     trees = bunch.shape[0] / worlds
-    for i in range(joints):
-        observation_out[world, i] = qpos[world, q[i]]
-        observation_out[world, joints + i] = qvel[world, v[i]]
-    rotation = xmat[world, tool_body]
-    point = xpos[world, tool_body] + rotation * tool
+    point = observe_arm(world, arm, observation_out)
     wanted = target[world]
     tree = wanted * worlds + world
     away = bunch_middle(body_q, bunch[tree], bunch_com[tree]) - point
@@ -90,6 +108,8 @@ def observe(
         if world_contacts.tree[at] / worlds != wanted:
             force = force + float(wp.length(contacts.force[at]))
     observation_out[world, place] = force
+    for k in range(trees):
+        observation_out[world, place + 1 + k] = wp.where(k == wanted, 1.0, 0.0)
     effort = float(0.0)
     for i in range(action.shape[1]):
         effort = effort + action[world, i] * action[world, i]

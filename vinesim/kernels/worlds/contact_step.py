@@ -108,6 +108,7 @@ def write_world_rows(
     slots: int,
     rigid_bodies: int,
     dofs: int,
+    friction_scale: wp.array(dtype=wp.float64),
     bodies: PlantBodies,
     rigid: RigidBodies,
     candidates: Candidates,
@@ -119,7 +120,8 @@ def write_world_rows(
 ):
     """One thread per contact slot of a world. Write the three rows of the contact in this slot.
 
-    rigid_bodies, dofs: numbers of MuJoCo bodies and degrees of freedom of a world.
+    rigid_bodies, dofs: numbers of MuJoCo bodies and degrees of freedom of a world. friction_scale: [world] factor of the
+    coefficients of friction.
     """
     world, c = world_and_entry(wp.tid(), slots)
     if world < worlds and c < world_contacts.count[wp.min(world, worlds - 1)]:
@@ -148,6 +150,9 @@ def write_world_rows(
             contacts,
             rows,
         )
+        surface = contacts.surface[c]
+        surface.friction = surface.friction * friction_scale[world]
+        contacts.surface[c] = surface
 
 
 @wp.func
@@ -477,21 +482,31 @@ def add_contact_efforts(
     worlds: int,
     dofs: int,
     rows_all: Rows,
+    contacts_all: Contacts,
+    moving: wp.array(dtype=wp.int32),
     world_contacts: WorldContacts,
+    qacc: wp.array2d(dtype=float),
     # out
     effort_out: wp.array2d(dtype=float),
+    likely_out: wp.array2d(dtype=float),
 ):
     """One thread per degree of freedom of a world's rigid bodies. Write the generalised force of the contacts with
-    plants.
+    plants, and the acceleration with this force if all constraints keep their states.
 
-    effort: [world, dof] N or N m.
+    moving: [1] number of geoms that can move. qacc: [world, dof] m/s^2 or rad/s^2, acceleration without these contacts.
+    effort: [world, dof] N or N m. likely: [world, dof] m/s^2 or rad/s^2.
     """
     world = wp.tid() % worlds
     dof = wp.tid() / worlds
     rows = view_rows(rows_all, world, worlds, dofs)
     effort = wp.float64(0.0)
+    change = wp.float64(0.0)
     for c in range(world_contacts.count[world]):
-        entry = rows.rigid_jacobian[c, dof]
-        for r in range(3):
-            effort = effort - entry[r] * rows.impulse[3 * c + r]
+        if contacts_all.other[c * worlds + world] < moving[0]:
+            entry = rows.rigid_jacobian[c, dof]
+            response = rows.rigid_response[c, dof]
+            for r in range(3):
+                effort = effort - entry[r] * rows.impulse[3 * c + r]
+                change = change - response[r] * rows.impulse[3 * c + r]
     effort_out[world, dof] = wp.float32(effort / parameters.dt)
+    likely_out[world, dof] = qacc[world, dof] + wp.float32(change / parameters.dt)

@@ -46,8 +46,14 @@ class EffectiveMass:
     """[entry] Column of the entry: MuJoCo's M_colind."""
     nefc: wp.array(dtype=wp.int32)
     """[world] Number of rows of active constraints."""
+    J_rownnz: wp.array2d(dtype=wp.int32)
+    """[world, row] Number of entries of a row of the constraints' Jacobian."""
+    J_rowadr: wp.array2d(dtype=wp.int32)
+    """[world, row] Index of the first entry of the row."""
+    J_colind: wp.array3d(dtype=wp.int32)
+    """[world, 0, entry] Degree of freedom of the entry."""
     J: wp.array3d(dtype=float)
-    """[world, row, dof] Jacobian of the constraints."""
+    """[world, 0, entry] Jacobian of the constraints, sparse."""
     D: wp.array2d(dtype=float)
     """[world, row] Stiffness of the constraints."""
     state: wp.array2d(dtype=wp.int32)
@@ -139,11 +145,14 @@ def invert_effective_mass(
     for row in range(mass.nefc[world]):
         if mass.state[world, row] == QUADRATIC:
             stiffness = wp.float64(mass.D[world, row])
-            for i in range(dofs):
-                along = stiffness * wp.float64(mass.J[world, row, i])
-                if along != wp.float64(0.0):
-                    for k in range(dofs):
-                        H[i, k] = H[i, k] + along * wp.float64(mass.J[world, row, k])
+            begin = mass.J_rowadr[world, row]
+            end = begin + mass.J_rownnz[world, row]
+            for at in range(begin, end):
+                i = mass.J_colind[world, 0, at]
+                along = stiffness * wp.float64(mass.J[world, 0, at])
+                for other in range(begin, end):
+                    k = mass.J_colind[world, 0, other]
+                    H[i, k] = H[i, k] + along * wp.float64(mass.J[world, 0, other])
     one = wp.float64(1.0)
     for pivot in range(dofs):
         scale = one / H[pivot, pivot]

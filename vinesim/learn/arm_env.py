@@ -1,0 +1,107 @@
+"""What the tasks with an arm in front of shoots share: worlds, actions, and what differs between worlds."""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from vinesim.kernels.graph import KernelLaunch
+from vinesim.kernels.learn.reach import ArmState, move_targets
+from vinesim.learn.arm import AXES, JOINT_LIMIT, TOOL, TOOL_LINK, arm
+from vinesim.learn.task_env import STEPS, TaskEnv, check_options
+from vinesim.learn.variation import Variation, as_variation
+from vinesim.scene.model import Model
+from vinesim.worlds.plants import plants_of_worlds
+from vinesim.worlds.worlds import Worlds
+
+DISTANCE = 1.2
+"""[m] From the origin to the row of shoots."""
+BASE = (-0.1, 0.0, 0.6)
+"""[m] Place of the base of the arm."""
+HOME = np.array([0.0, -2.3, 0.0, 1.9, 0.0, 1.6, 0.0, 0.0, 0.0])
+"""First positions of the joints [rad] and fingers [m]."""
+MAX_EPISODE_STEPS = 100
+SPEED = 1.0
+"""[rad/s] Speed of a joint's target at action 1."""
+LEAD = 0.3
+"""[rad] Largest distance of a joint's target from the joint."""
+VARIANTS = 64
+"""Number of different groups of shoots; further worlds repeat them."""
+Plants = Callable[[np.random.Generator, Variation], Model]
+
+
+class ArmEnv(TaskEnv):
+    """A task of an arm of seven joints. Its action [7], from -1 to 1, sets the speeds of the targets of the joints, in
+    units of 1 rad/s.
+
+    Args:
+        plants: returns the plants of a world.
+        numbers: number of an observation's components.
+        num_envs: number of worlds.
+        device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
+        arrays: ``"numpy"``, ``"torch"`` or ``"warp"``; see :class:`~vinesim.learn.task_env.TaskEnv`, which also
+            describes ``info`` and errors.
+        vines_seed: seed of what differs between worlds, which stays the same after a reset.
+        variation: ranges of these numbers, or a TOML file with them.
+        max_episode_steps: number of actions after which an episode is truncated.
+    """
+
+    def __init__(
+        self,
+        plants: Plants,
+        numbers: int,
+        num_envs: int = 1,
+        *,
+        device: str = "cpu",
+        arrays: str = "numpy",
+        vines_seed: int = 0,
+        variation: Variation | str | pathlib.Path = Variation(),
+        max_episode_steps: int = MAX_EPISODE_STEPS,
+        render_mode: str | None = None,
+    ) -> None:
+        check_options(num_envs, arrays, render_mode)
+        ranges = as_variation(variation)
+        variants = [
+            plants(np.random.default_rng([vines_seed, number]), ranges) for number in range(min(num_envs, VARIANTS))
+        ]
+        super().__init__(
+            Worlds(plants_of_worlds(variants, num_envs), num_envs, robots=[arm(BASE, HOME)], device=device),
+            len(AXES),
+            numbers,
+            device=device,
+            arrays=arrays,
+            variation=ranges,
+            rng=np.random.default_rng([vines_seed, VARIANTS]),
+            max_episode_steps=max_episode_steps,
+            render_mode=render_mode,
+        )
+
+    def _moves(self) -> list[KernelLaunch]:
+        bodies = self.worlds.bodies
+        joints = len(AXES)
+        limit = np.full(joints, JOINT_LIMIT)
+        q = self.on_device(bodies.rigid.robot("arm").q[:joints], wp.int32)
+        limits = [self.on_device(-limit, float), self.on_device(limit, float)]
+        given = [SPEED * STEPS * self.worlds.dt, *limits, LEAD, q, self._action, bodies.data.qpos]
+        return [KernelLaunch(move_targets, given, [bodies.targets], threads=self.num_envs, width=joints)]
+
+    def _arm_state(self) -> ArmState:
+        data = self.worlds.bodies.data
+        robot = self.worlds.bodies.rigid.robot("arm")
+        state = ArmState()
+        state.tool_body, state.tool = robot.bodies[TOOL_LINK], wp.vec3(*TOOL)
+        state.q, state.v = (self.on_device(index[: len(AXES)], wp.int32) for index in (robot.q, robot.v))
+        state.xpos, state.xmat, state.qpos, state.qvel = data.xpos, data.xmat, data.qpos, data.qvel
+        return state
+
+    def _bunches(self) -> list[Any]:
+        """Returns the arguments of kernels for the bunches [tree]: bodies, centres of mass, and poses of bodies."""
+        worlds = self.worlds
+        body = worlds.model.bunch_body
+        place = self.on_device(worlds.plants.buffers.slots[body], wp.int32)
+        centre = self.on_device(worlds.model.body_com[body], wp.vec3)
+        return [place, centre, worlds.plants.launches.resident_arrays["body_q"]]
