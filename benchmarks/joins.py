@@ -4,7 +4,7 @@ The server and the resident, a person with physics, are programs. The others are
 their own, who join in groups, stand next to the resident until it shows them all, and leave.
 
 The last rows are those of a router of Zenoh alone, to whose sessions the same happens: each subscribes to as many keys
-as a person, and ends, while another session subscribes to the same keys.
+as a person and publishes as many, and ends, while another session subscribes to the same keys.
 """
 
 from __future__ import annotations
@@ -84,14 +84,14 @@ def joins(count: int, announce: Callable[[str], None]) -> Iterator[Measurement]:
         yield Measurement("joins", case, growth, "MB", "budget, at most", BUDGET, None)
     for name, value in sorted(faults.items()):
         yield Measurement("joins", f"resident client: {name.replace('_', ' ')}", value, "1")
-    for what, pattern in (("keys with a wildcard", "k/{}/*"), ("keys without a wildcard", "k/{}/x")):
-        growth = _bare_growth([pattern.format(number) for number in range(SUBSCRIPTIONS)])
+    for what, end in (("keys with a wildcard", "*"), ("keys without a wildcard", "all")):
+        growth = _bare_growth([f"k/{number}/{end}" for number in range(SUBSCRIPTIONS)])
         yield Measurement("joins", f"router of Zenoh alone, {SUBSCRIPTIONS} {what}: growth", growth, "kB per session")
 
 
 def _bare_growth(keys: list[str]) -> float:
-    """Returns by how much a router of Zenoh grows [kB] with each session that subscribes to ``keys`` and ends, while
-    another session subscribes to the same ``keys``."""
+    """Returns by how much a router of Zenoh grows [kB] with each session that subscribes to ``keys``, publishes under
+    as many keys with its own name, and ends, while another session subscribes to the same ``keys``."""
     with own_processes() as group:
         router = group.start("router", "-c", ROUTER)
         endpoint = router.next_line(START_TIMEOUT)
@@ -99,11 +99,13 @@ def _bare_growth(keys: list[str]) -> float:
         with open_session(settings) as resident:
             kept = [resident.declare_subscriber(key, _ignore) for key in keys]
             sizes = []
-            for _ in range(2):
-                for _ in range(BARE_SESSIONS):
+            for half in range(2):
+                for number in range(BARE_SESSIONS):
                     with open_session(settings) as guest:
-                        declared = [guest.declare_subscriber(key, _ignore) for key in keys]
-                        for entity in declared:
+                        name = f"guest_{half}_{number}"
+                        subscribers = [guest.declare_subscriber(key, _ignore) for key in keys]
+                        publishers = [guest.declare_publisher(f"{key.rpartition('/')[0]}/{name}") for key in keys]
+                        for entity in [*publishers, *subscribers]:
                             entity.undeclare()
                 router.write_line("release")
                 router.next_line(START_TIMEOUT)
