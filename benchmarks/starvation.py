@@ -54,9 +54,8 @@ def starvation(times: int, seed: int, announce: Callable[[str], None]) -> Iterat
             world.wait_until_served(time.monotonic(), len(names) - 1, PATIENCE)
             after = time.monotonic() - end
             took[kind].append(after)
-            announce(
-                f"{number + 1} of {times}, {kind}{f' for {duration:.1f} s' if duration else ''}: all are served after {after:.1f} s"
-            )
+            what = kind + (f" for {duration:.1f} s" if duration else "")
+            announce(f"{number + 1} of {times}, {what}: all are served after {after:.1f} s")
     for kind, found in took.items():
         if not found:
             continue
