@@ -3,7 +3,9 @@
 A server with certificates and a person's client are programs of their own. The hostile actor stands next to the person,
 and sends as fast as its process can: poses, states of trees and objects, claims, records, forces, voices, corrupted
 messages of all kinds, queries, joins, tokens and meshes. Quiet and hostile times take turns, so that other load on the
-machine touches both. What counts is the processor time of a step of the person's client, and of the server.
+machine touches both. What counts is processor time, not the time of a clock, because the hostile process takes a core
+for itself: that of a step of the person's client without its threads that read the network, that of these threads, and
+that of the server.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 import zenoh
@@ -97,10 +100,37 @@ class _Person:
         return float(self.status["time"])  # type: ignore[arg-type]
 
 
-def _used(program: Program) -> float:
-    """Returns the processor time that a program has used [s]."""
-    fields = pathlib.Path(f"/proc/{program.child.pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+class _Cost(NamedTuple):
+    """Processor time in one turn."""
+
+    step: float
+    """Of a step of the honest client, without threads of the network [s]."""
+    network: float
+    """Of the honest client's threads that read the network, in a second [s]."""
+    server: float
+    """Of the server, in a second [s]."""
+
+
+NETWORK_THREADS = ("rx-", "tx-", "net-", "acc-", "app-")
+"""First letters of the names of Zenoh's threads, which also call the client's callbacks."""
+
+
+def _used(program: Program) -> tuple[float, float]:
+    """Returns the processor times that Zenoh's threads and all other threads of a program have used [s]."""
+    network = 0.0
+    for thread in pathlib.Path(f"/proc/{program.child.pid}/task").iterdir():
+        with contextlib.suppress(OSError):  # the thread may have ended meanwhile
+            name, used = _times(thread / "stat")
+            network += used if name.startswith(NETWORK_THREADS) else 0.0
+    _, both = _times(pathlib.Path(f"/proc/{program.child.pid}/stat"))
+    return network, both - network
+
+
+def _times(stat: pathlib.Path) -> tuple[str, float]:
+    """Returns the name of a process or thread, and the processor time that it has used [s]."""
+    begin, _, end = stat.read_text().rpartition(")")
+    fields = end.split()
+    return begin.partition("(")[2], (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _attacks(evil: FakeClient, bus: ZenohBus, place: np.ndarray, seed: int) -> dict[str, Attack]:
@@ -194,24 +224,28 @@ def hostile_actor(minutes: float, seed: int, announce: Callable[[str], None]) ->
             time.sleep(0.02)
             if time.monotonic() > end:
                 raise ProgramFailed("the honest client does not see the hostile one")
-        costs: dict[str, list[tuple[float, float, float]]] = {}
-        quiet: list[tuple[float, float]] = []
+        costs: dict[str, list[tuple[float, _Cost]]] = {}
+        quiet: list[_Cost] = []
         turns = max(1, round(60.0 * minutes / TURN))
         for turn in range(turns):
             kind = list(attacks)[turn % len(attacks)]
             alone = _turn(person, lambda: (evil.tick(time.monotonic()), time.sleep(0.02)))
             under = _turn(person, attacks[kind])
             quiet.append(alone)
-            costs.setdefault(kind, []).append((under[0] / alone[0], under[1], alone[1]))
-            announce(f"turn {turn + 1} of {turns}, {kind}: a step takes {under[0] / alone[0]:.2f} times as long")
+            ratio = under.step / alone.step
+            costs.setdefault(kind, []).append((ratio, under))
+            announce(
+                f"turn {turn + 1} of {turns}, {kind}: a step takes {ratio:.2f} times the processor time, "
+                f"the network {100.0 * under.network:.0f} % of a core"
+            )
         faults = person.status["faults"]
     yield from _rows(costs, quiet)
     yield Measurement("hostile actor", "messages that the honest client refused", sum(faults.values()), "1")  # type: ignore[attr-defined]
 
 
-def _turn(person: _Person, act: Attack) -> tuple[float, float]:
-    """Have a thread call ``act`` again and again for a :data:`TURN`. Returns the processor time of a step of the client
-    [s], and that of the server in a second [s], between two status lines of the client."""
+def _turn(person: _Person, act: Attack) -> _Cost:
+    """Have a thread call ``act`` again and again for a :data:`TURN`. Returns the costs between two status lines of the
+    client."""
     stop = threading.Event()
 
     def run() -> None:
@@ -226,33 +260,33 @@ def _turn(person: _Person, act: Attack) -> tuple[float, float]:
             person.wait_for_line()
         first = person.wait_for_line()
         begin = time.monotonic()
-        before = _used(person.client), _used(person.server)
+        network, steps = _used(person.client)
+        server = sum(_used(person.server))
         last = first
         while time.monotonic() < begin + TURN or last <= first:
             last = person.wait_for_line()
-        used = _used(person.client) - before[0], _used(person.server) - before[1]
+        network_end, steps_end = _used(person.client)
         passed = time.monotonic() - begin
+        server_share = (sum(_used(person.server)) - server) / passed
     finally:
         stop.set()
         thread.join()
-    return used[0] / ((last - first) / DT), used[1] / passed
+    return _Cost((steps_end - steps) / ((last - first) / DT), (network_end - network) / passed, server_share)
 
 
-def _rows(
-    costs: dict[str, list[tuple[float, float, float]]], quiet: list[tuple[float, float]]
-) -> Iterator[Measurement]:
+def _rows(costs: dict[str, list[tuple[float, _Cost]]], quiet: list[_Cost]) -> Iterator[Measurement]:
     bench = "hostile actor"
-    yield Measurement(
-        bench, "a step of the honest client in quiet times, mean", 1e3 * float(np.mean([q[0] for q in quiet])), "ms"
-    )
-    yield Measurement(
-        bench, "the server in quiet times, mean", 1e2 * float(np.mean([q[1] for q in quiet])), "% of a core"
-    )
+    step = 1e3 * float(np.mean([one.step for one in quiet]))
+    yield Measurement(bench, "a step of the honest client in quiet times, mean", step, "ms")
+    for what in ("network", "server"):
+        share = 1e2 * float(np.mean([getattr(one, what) for one in quiet]))
+        yield Measurement(bench, f"the {what} in quiet times, mean", share, "% of a core")
     for kind, found in costs.items():
-        ratio = float(np.median([one[0] for one in found]))
+        ratio = float(np.median([ratio for ratio, _ in found]))
         case = f"{kind}: a step of the honest client, times that in quiet times"
         yield Measurement(bench, case, ratio, "1", "budget, at most", BUDGET, BUDGET / ratio)
-        server = 1e2 * float(np.median([one[1] for one in found]))
-        yield Measurement(bench, f"{kind}: the server", server, "% of a core")
-    every = float(np.median([one[0] for found in costs.values() for one in found]))
+        for what in ("network", "server"):
+            share = 1e2 * float(np.median([getattr(cost, what) for _, cost in found]))
+            yield Measurement(bench, f"{kind}: the {what}", share, "% of a core")
+    every = float(np.median([ratio for found in costs.values() for ratio, _ in found]))
     yield Measurement(bench, "all kinds, median", every, "1", "budget, at most", BUDGET, BUDGET / every)

@@ -2,6 +2,9 @@
 
 The server and the resident, a person with physics, are programs. The others are people with bodies, without physics of
 their own, who join in groups, stand next to the resident until it shows them all, and leave.
+
+The last rows are those of a router of Zenoh alone, to whose sessions the same happens: each subscribes to as many keys
+as a person and publishes as many, and ends, while another session subscribes to the same keys.
 """
 
 from __future__ import annotations
@@ -10,12 +13,15 @@ import contextlib
 import time
 from collections.abc import Callable, Iterator
 
+import zenoh
+
 from benchmarks.support.fake_client import FakeClient
 from benchmarks.support.small_world import SmallWorld, beside
 from vinesim.bench.live_client import own_processes
 from vinesim.bench.process_memory import check_proc, sample_process
-from vinesim.client.programs import ProgramFailed
+from vinesim.client.programs import START_TIMEOUT, ProgramFailed
 from vinesim.net.transport.zenoh_bus import ZenohBus
+from vinesim.net.transport.zenoh_session import config, open_session
 from vinesim.scene.values import Measurement
 
 GROUP = 20
@@ -26,6 +32,25 @@ BUDGET = 5.0
 """Largest accepted growth of a process after :data:`SETTLING` joins [MB]."""
 TIMEOUT = 300.0
 """Longest time for a group to join or to leave [s]."""
+SUBSCRIPTIONS = 85
+"""Number of keys with a wildcard to which a person subscribes and its neighbours do, too."""
+BARE_SESSIONS = 300
+"""Number of sessions of the router of Zenoh alone between two measurements."""
+
+ROUTER = """
+import sys
+from vinesim.core.allocator import release_free_memory
+from vinesim.net.transport.endpoints import resolve_ports
+from vinesim.net.transport.zenoh_session import config, open_session
+
+(endpoint,) = resolve_ports(["tcp/127.0.0.1:0"], secured=False)
+session = open_session(config("router", listen__endpoints=[endpoint.locator]))
+print(endpoint, flush=True)
+for _ in sys.stdin:
+    release_free_memory()
+    print("released", flush=True)
+session.close()
+"""
 
 
 def joins(count: int, announce: Callable[[str], None]) -> Iterator[Measurement]:
@@ -59,6 +84,39 @@ def joins(count: int, announce: Callable[[str], None]) -> Iterator[Measurement]:
         yield Measurement("joins", case, growth, "MB", "budget, at most", BUDGET, None)
     for name, value in sorted(faults.items()):
         yield Measurement("joins", f"resident client: {name.replace('_', ' ')}", value, "1")
+    for what, end in (("keys with a wildcard", "*"), ("keys without a wildcard", "all")):
+        growth = _bare_growth([f"k/{number}/{end}" for number in range(SUBSCRIPTIONS)])
+        yield Measurement("joins", f"router of Zenoh alone, {SUBSCRIPTIONS} {what}: growth", growth, "kB per session")
+
+
+def _bare_growth(keys: list[str]) -> float:
+    """Returns by how much a router of Zenoh grows [kB] with each session that subscribes to ``keys``, publishes under
+    as many keys with its own name, and ends, while another session subscribes to the same ``keys``."""
+    with own_processes() as group:
+        router = group.start("router", "-c", ROUTER)
+        endpoint = router.next_line(START_TIMEOUT)
+        settings = config("client", connect__endpoints=[endpoint])
+        with open_session(settings) as resident:
+            kept = [resident.declare_subscriber(key, _ignore) for key in keys]
+            sizes = []
+            for half in range(2):
+                for number in range(BARE_SESSIONS):
+                    with open_session(settings) as guest:
+                        name = f"guest_{half}_{number}"
+                        subscribers = [guest.declare_subscriber(key, _ignore) for key in keys]
+                        publishers = [guest.declare_publisher(f"{key.rpartition('/')[0]}/{name}") for key in keys]
+                        for entity in [*publishers, *subscribers]:
+                            entity.undeclare()
+                router.write_line("release")
+                router.next_line(START_TIMEOUT)
+                sizes.append(sample_process(router.child.pid).own)
+            for entity in kept:
+                entity.undeclare()
+    return 1000.0 * (sizes[1] - sizes[0]) / BARE_SESSIONS
+
+
+def _ignore(_: zenoh.Sample) -> None:
+    """Callback of subscriptions whose messages do not matter."""
 
 
 def _join(world: SmallWorld, first: int) -> None:

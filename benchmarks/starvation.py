@@ -1,7 +1,7 @@
 """``python -m benchmarks starvation``: clients that get no processor time for a while; whether all are served again.
 
-Two people with physics and a server are programs. In turns one of the clients, or the server, is stopped (SIGSTOP), or
-busy loops take the processor from all.
+Two people with physics and a server are programs. In turns one of the clients, or the server, is stopped (SIGSTOP),
+busy loops take the processor from all, or the server is killed and another one is started at once.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ BOUND = 15.0
 """Largest accepted time from the end of a starvation until all are served [s]."""
 PATIENCE = 120.0
 """Time after which a round counts as failed [s]."""
-KINDS = ("a client is stopped", "the server is stopped", "busy loops")
+KINDS = ("a client is stopped", "the server is stopped", "busy loops", "the server is killed")
 
 
 def starvation(times: int, seed: int, announce: Callable[[str], None]) -> Iterator[Measurement]:
@@ -41,14 +41,21 @@ def starvation(times: int, seed: int, announce: Callable[[str], None]) -> Iterat
             kind = KINDS[number % len(KINDS)]
             duration = float(random.uniform(0.5, LONGEST))
             names = list(world.clients)
-            if kind == KINDS[2]:
+            if kind == KINDS[0]:
+                _stop(world, world.clients[names[int(random.integers(len(names)))]].child.pid, duration)
+            elif kind == KINDS[1]:
+                _stop(world, world.server.child.pid, duration)
+            elif kind == KINDS[2]:
                 _run_loops(world, duration)
-            else:
-                victim = world.server if kind == KINDS[1] else world.clients[names[int(random.integers(len(names)))]]
-                _stop(world, victim.child.pid, duration)
-            after = world.wait_until_served(time.monotonic(), len(names) - 1, PATIENCE)
+            end = time.monotonic()
+            if kind == KINDS[3]:
+                duration = 0.0
+                world.kill_server()
+            world.wait_until_served(time.monotonic(), len(names) - 1, PATIENCE)
+            after = time.monotonic() - end
             took[kind].append(after)
-            announce(f"{number + 1} of {times}, {kind} for {duration:.1f} s: all are served after {after:.1f} s")
+            what = kind + (f" for {duration:.1f} s" if duration else "")
+            announce(f"{number + 1} of {times}, {what}: all are served after {after:.1f} s")
     for kind, found in took.items():
         if not found:
             continue

@@ -24,9 +24,9 @@ class SmallWorld:
     """One server, and people who stand next to each other."""
 
     def __init__(self, group: ProgramGroup, people: int) -> None:
+        self._group = group
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
-        words = ("--listen", self.endpoint, "--status", "json", "--real-time-factor", f"{FACTOR:g}")
-        self.server = group.start("server", "-m", "vinesim", "server", *words)
+        self.server = self._start_server()
         self.server.next_line(START_TIMEOUT)
         self.model = generate(load_scene(SCENE))
         self.place = bunch_centres(self.model)[0, :2] - (1.5, 0.0)
@@ -43,9 +43,27 @@ class SmallWorld:
                 name, "-m", "vinesim", "client", "--role", "human", "--name", name, *common
             )
 
+    def _start_server(self) -> Program:
+        words = ("--listen", self.endpoint, "--status", "json", "--real-time-factor", f"{FACTOR:g}")
+        return self._group.start("server", "-m", "vinesim", "server", *words)
+
+    def kill_server(self) -> None:
+        """Kill the server, start another one in its place, and wait until that one lists all people. Raises
+        :class:`ProgramFailed` if it prints nothing for :data:`START_TIMEOUT`."""
+        self.server.child.kill()
+        self.server.child.wait()
+        self.server = self._start_server()
+        names = {f"vineyard/{name}" for name in self.clients}
+        while not names <= {*json.loads(self.server.next_line(START_TIMEOUT))["actors"]}:
+            self.read_clients()
+
     def read(self) -> None:
         """Read new status lines. Raises :class:`ProgramFailed` if a program has ended."""
         self.server.new_lines()
+        self.read_clients()
+
+    def read_clients(self) -> None:
+        """Read new status lines of the people. Raises :class:`ProgramFailed` if one has ended."""
         for name, client in self.clients.items():
             for line in client.new_lines():
                 self.newest[name] = json.loads(line)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import gc
 import logging
+import os
 import pathlib
+import re
 import signal
 import subprocess
 import sys
@@ -332,6 +334,36 @@ def test_the_memory_of_a_server_and_of_a_client_does_not_grow_with_joins_and_lea
             tracemalloc.stop()
         assert after - before < 200 * 250  # B for each join; one entry in one table by name has more
         assert len(server._admission._admitted) == 1
+
+
+GUESTS = """
+import time, zenoh
+from vinesim.net.codec.control import Hello, encode_hello
+from vinesim.net.server.server import Server
+from vinesim.net.transport.zenoh_bus import ZenohBus
+
+zenoh.init_log_from_env_or("error")
+with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
+    for name in ("guest_0", "guest_1", "guest_2"):
+        with ZenohBus(name, connect=server.endpoint) as bus:
+            bus.join(encode_hello(Hello(name, digest="D")))
+    ada.close()
+    while server.actors:
+        time.sleep(0.01)
+"""
+
+
+def test_a_router_keeps_no_key_with_the_name_of_an_actor_that_has_left():
+    """By Zenoh's own log: what it registers under the names of guests it also removes."""
+    log_of = os.environ | {"RUST_LOG": "zenoh::net::routing::dispatcher::resource=debug", "NO_COLOR": "1"}
+    ran = subprocess.run([sys.executable, "-c", GUESTS], env=log_of, capture_output=True, text=True, timeout=60.0)
+    assert ran.returncode == 0, ran.stderr
+    found = re.findall(
+        r"(Register|Unregister) resource \S*/(live/guest_\d\S*)", re.sub(r"\x1b\[[0-9;]*m", "", ran.stdout)
+    )
+    registered, removed = ({key for what, key in found if what == wanted} for wanted in ("Register", "Unregister"))
+    assert len(registered) >= 3
+    assert not registered - removed
 
 
 def test_sessions_are_no_more_than_the_system_has_files_for(monkeypatch, caplog):

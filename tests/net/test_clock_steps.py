@@ -44,7 +44,7 @@ class World:
 
 @pytest.mark.parametrize("step", [-3600.0, 3600.0, -2.0])
 def test_a_server_whose_clock_is_set_stops_no_stream(step):
-    """A restarted server takes its clock from the time of day, which may have been set meanwhile."""
+    """Another server in the place of the first one begins with its own time of day if no client has reported to it."""
     world = World()
     world.run(1.5)
     world.ada.apply({"touch": [TREE]})

@@ -153,3 +153,22 @@ def test_a_fixed_factor_waits_for_nobody() -> None:
 def test_a_pace_is_described_only_below_real_time() -> None:
     assert describe(1.0, "") == ""
     assert describe(0.431, "ada: sensors") == "0.43 of real time (ada: sensors)"
+
+
+def test_a_new_clock_goes_on_from_the_latest_time_that_clients_report_and_not_beyond_real_time() -> None:
+    clock = WorldClock(0.0, 1000.0, open_until=10.0)
+    assert clock.awaits_report(0.5)
+    clock.report("bob", 1.0, PaceReport(200.0, 1.0))
+    assert clock.time(1.0) == 200.0
+    assert not clock.awaits_report(1.0)
+    clock.report("ada", 2.0, PaceReport(300.0, 1.0))
+    assert clock.time(2.0) == 300.0
+    clock.report("bob", 3.0, PaceReport(201.0, 1.0))
+    assert clock.time(3.0) > 300.0, "it does not go back"
+    clock.report("eve", 3.0, PaceReport(1e12, 1.0))
+    assert clock.time(3.0) == 1003.0
+    clock.report("bob", 11.0, PaceReport(1011.0, 1.0))
+    assert clock.time(11.0) < 1011.0, "later reports only brake it"
+    hostile = WorldClock(0.0, 1000.0, open_until=10.0)
+    hostile.report("eve", 1.0, PaceReport(-1e300, 1.0))
+    assert hostile.time(1.0) == 0.0

@@ -10,9 +10,11 @@ import sys
 import threading
 import time
 
+import numpy as np
 import pytest
 import zenoh
 
+from benchmarks.support.fake_client import FakeClient, tree_row
 from tests.support import programs
 from tests.support.waiting import deadline, wait
 from vinesim.net.codec.control import (
@@ -270,6 +272,45 @@ def test_a_client_announces_itself_again_to_a_restarted_server():
             second.close()
         with Server(endpoint, scene=SceneId("tendone", "D2")):
             wait(lambda: "'tendone'" in ada.status_message, "ada to be refused for another scene")
+
+
+def test_a_restarted_server_goes_on_with_the_time_that_its_clients_have(monkeypatch):
+    """The world of the first server is an hour and a half behind the time of day, as one that was slow for long."""
+    behind = 5400.0
+    time_of_day = time.time
+    monkeypatch.setattr(time, "time", lambda: time_of_day() - behind)
+    first = Server("tcp/127.0.0.1:0")
+    monkeypatch.setattr(time, "time", time_of_day)
+    with first, contextlib.ExitStack() as stack:
+        world = tree_row(1)
+        clients = [
+            FakeClient(stack.enter_context(ZenohBus(name, connect=first.endpoint)), world, (x, 0.0), kind="human")
+            for name, x in (("ada", 1.0), ("bob", 2.0))
+        ]
+        for client in clients:
+            clock = client.replicator
+            clock.report_pace(lambda clock=clock: PaceReport(clock.network_time(time.monotonic()), 1.0, "steps"))
+        times: list[list[float]] = [[], []]
+
+        def run(condition) -> None:
+            def tick() -> bool:
+                now = time.monotonic()
+                for client, own in zip(clients, times, strict=True):
+                    client.tick(now)
+                    own.append(client.replicator.network_time(now))
+                return condition()
+
+            wait(tick, "the clients")
+
+        run(lambda: first.pings > 20 and all(abs(own[-1] + behind - time_of_day()) < 1.0 for own in times))
+        first.close()
+        run(lambda: all(client.bus.status_message for client in clients))
+        for own in times:
+            del own[:-1]
+        with Server(first.endpoint) as second:
+            run(lambda: second.pings > 20 and second.joined == 2)
+            assert all(abs(np.diff(own)).max() < 1.0 for own in times)
+            assert abs(second.time + behind - time_of_day()) < 2.0
 
 
 # ---------------------------------------------------------------- retained records
@@ -583,8 +624,9 @@ def test_the_documented_configuration_for_stock_routers_works():
         close_session(router)
 
 
-def test_only_actors_with_a_body_that_were_admitted_slow_their_own_world():
+def test_only_actors_with_a_body_that_were_admitted_slow_their_own_world(monkeypatch):
     """A spectator, a stranger and an actor of another world report that they can follow a tenth of real time."""
+    monkeypatch.setattr("vinesim.net.server.server.GRACE_TIME", 0.0)  # else strangers' reports get no answer at first
     slow = encode_time(0.0, report=PaceReport(0.0, 0.1, "steps"))
 
     def reported_by(bus: ZenohBus, factor_falls: bool) -> None:

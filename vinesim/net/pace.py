@@ -4,6 +4,9 @@ Clients report the time that their steps have reached, and the largest real-time
 factor of the world falls quickly to the smallest of the reported factors, and rises slowly. If a client falls behind
 nevertheless, the clock slows down within half a second of simulated time, so that the client need not skip steps. A
 client that reports nothing for :data:`SILENCE` is left behind: the world does not wait for it until it has caught up.
+
+A server that was restarted does not know the time of its worlds, but the clients do: for a while after the start, the
+clock of a world goes on from the latest time that a client reports.
 """
 
 from __future__ import annotations
@@ -80,9 +83,11 @@ class _Client:
 class WorldClock:
     """The clock of one world. All arguments ``now`` are real time [s] of one monotonic clock."""
 
-    def __init__(self, now: float, time: float = 0.0, factor: float | None = None) -> None:
+    def __init__(
+        self, now: float, time: float = 0.0, factor: float | None = None, *, open_until: float = -math.inf
+    ) -> None:
         """``time``: time of the world at ``now`` [s]. ``factor``: fixed real-time factor; None: as fast as clients can
-        follow."""
+        follow. ``open_until``: ``now`` [s] until which the clock takes its time from reports."""
         self.is_fixed = factor is not None
         self.factor = 1.0 if factor is None else factor
         """Present real-time factor of the world: seconds of simulated time in a second of real time."""
@@ -90,6 +95,8 @@ class WorldClock:
         """Client that limits the factor, and the cause: "picker: sensors". Empty while nothing limits it."""
         self._time = time
         self._now = now
+        self._open_until = open_until
+        self._begin = now, time
         self._pace = self.factor
         """Real-time factor before it is reduced for clients that are behind."""
         self._clients: dict[str, _Client] = {}
@@ -103,15 +110,33 @@ class WorldClock:
         """Returns the time of the world [s] at ``now`` [s], which is not earlier than the last :meth:`advance`."""
         return self._time + self.factor * (now - self._now)
 
+    def awaits_report(self, now: float) -> bool:
+        """Whether the time of the world is not known at ``now`` [s], because the clients that may know it have not
+        reported."""
+        return now < self._open_until and not self._clients
+
     def report(self, name: str, now: float, report: PaceReport) -> None:
         """Store a report that arrived from the client ``name`` at ``now`` [s]."""
         self.advance(now)
+        if now < self._open_until:
+            self._take(report.time)
         lag = max(self._time - report.time, 0.0)
         before = self._clients.get(name)
         stays_behind = before is not None and before.is_left_behind and lag >= STOP_LAG
         if before is not None and before.is_left_behind and not stays_behind:
             log.info("%s follows the world's clock again", name)
         self._clients[name] = _Client(report, now, lag, is_left_behind=stays_behind)
+
+    def _take(self, reached: float) -> None:
+        """Go on from the time that a client has ``reached`` [s]: from that of the first client in any case, from that
+        of further ones if they are ahead.
+
+        No client is ahead of a world that passed in real time since the clock began, so no report moves the clock
+        beyond that.
+        """
+        begin, time = self._begin
+        reached = min(max(reached, 0.0), time + self._now - begin)
+        self._time = max(self._time, reached) if self._clients else reached
 
     def forget(self, name: str) -> None:
         """Remove a client that has left."""

@@ -36,6 +36,10 @@ CURRENT_AGE = 0.75
 SLEW_TIME = 0.5
 """Time constant with which own time approaches the world's time [s]."""
 
+MAX_REPORTED_LAG = 3600.0
+"""Largest difference between network time and the time of a report [s]. Steps that are further away follow another
+clock, and say nothing about the time of this world."""
+
 MAX_SLEW = 0.25
 """Largest relative change of the rate of own time while it approaches the world's time."""
 
@@ -116,7 +120,12 @@ class NetworkClock:
         if self._now - self._pinged >= PING_PERIOD[self._ping_count >= 2 * PING_WINDOW]:
             self._pinged = self._now
             self._ping_count = self._ping_count + 1
-            self._bus.query(f"clock/{self._bus.name}", encode_time(self._now, report=self.report()))
+            self._bus.query(f"clock/{self._bus.name}", encode_time(self._now, report=self._own_report()))
+
+    def _own_report(self) -> PaceReport | None:
+        """Returns the report of this client; None before the first reply, and while its steps follow another clock."""
+        report = None if self._known is None else self.report()
+        return None if report is None or abs(report.time - self.time) > MAX_REPORTED_LAG else report
 
     def receive(self, payload: bytes, age: float) -> None:
         """Use a reply to a ping, which arrived ``age`` [s] of real time ago, for the estimate of the world's time.

@@ -148,8 +148,8 @@ class Server:
         self._fixed_factor = real_time_factor
         self._start = time.monotonic(), time.time()
         """Readings of ``time.monotonic`` and of ``time.time`` (seconds since 1970) when the server started [s]. The
-        time of every world counts from the second reading and advances by the monotonic clock. So the time of a world
-        does not jump when the date or time of the machine is set."""
+        time of every new world counts from the second reading and advances by the monotonic clock. So the time of a
+        world does not jump when the date or time of the machine is set."""
         self._clocks: dict[str, WorldClock] = {}
         """Clocks by world."""
         self.pings = 0
@@ -256,7 +256,12 @@ class Server:
             return clock
         now = time.monotonic()
         (real, begin) = self._start
-        clock = WorldClock(now, begin + (now - real) * (self._fixed_factor or 1.0), self._fixed_factor)
+        clock = WorldClock(
+            now,
+            begin + (now - real) * (self._fixed_factor or 1.0),
+            self._fixed_factor,
+            open_until=self._admission.reserved_until,
+        )
         if self._admission.has_actors(world) and len(self._clocks) < self._admission.limits.worlds:
             for name in [name for name in self._clocks if not self._admission.has_actors(name)][:-MAX_EMPTY_WORLDS]:
                 del self._clocks[name]
@@ -529,6 +534,8 @@ class Server:
                 clock = self._clock(world)
                 if report is not None:
                     clock.report(name, now, report)
+                elif question.report is not None and clock.awaits_report(now):
+                    return  # this client may know the time, and asks again when it has joined
                 world_time = clock.time(now)
                 factor = clock.factor
                 cause = clock.cause

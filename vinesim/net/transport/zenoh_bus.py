@@ -403,22 +403,26 @@ class ZenohBus:
         """Declare the liveliness token of this actor's name. Raises :class:`NameTaken` if another session holds it: by
         a token, unless the server says that no session joined with the name.
 
-        After the declaration the tokens of the name are read again. If two sessions declare the name at once, the later
-        one finds the token of the earlier one and leaves. If both read the tokens after both declarations, both leave.
+        After the declaration this is checked again. If two sessions declare the name at once, the later one finds the
+        token of the earlier one and leaves. If both read the tokens after both declarations, both leave.
         """
-        liveliness = self._session.liveliness()
         mine = str(self._session.zid())
-        if self._name_holders() - {mine} and self._holder(self.name) not in ("", mine):
-            raise NameTaken(self.name, self.world)
-        token = liveliness.declare_token(f"{self._prefix}live/{self.name}/{mine}")
-        if self._name_holders() - {mine} and self._holder(self.name) not in ("", mine):
-            raise NameTaken(self.name, self.world)
+        self._check_name(mine)
+        token = self._session.liveliness().declare_token(f"{self._prefix}live/{self.name}/{mine}")
+        self._check_name(mine)
         return token
 
-    def _name_holders(self) -> set[str]:
-        """Returns the ids of all sessions with a liveliness token of this actor's name."""
+    def _check_name(self, mine: str) -> None:
+        """Raise :class:`NameTaken` if another session than ``mine`` holds this actor's name.
+
+        The server is asked first, because a router of Zenoh 1.10 keeps some kB of each key that was ever asked for
+        tokens, for good.
+        """
+        if self._holder(self.name) in ("", mine):
+            return
         replies = self._session.liveliness().get(f"{self._prefix}live/{self.name}/*", timeout=CONNECT_TIMEOUT)
-        return {str(reply.ok.key_expr).rpartition("/")[2] for reply in replies if reply.ok is not None}
+        if {_token(reply.ok.key_expr)[1] for reply in replies if reply.ok is not None} - {mine}:
+            raise NameTaken(self.name, self.world)
 
     # ------------------------------------------------------------ called by Zenoh's threads
 
