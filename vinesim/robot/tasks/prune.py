@@ -247,10 +247,13 @@ class PruneCanes(Task):
             yield from self._reach(cut)
         try:
             yield from self._move(
-                "advance", lambda: self._tip(cut) - LAST_WAY * place.ahead, speed=0.20, timeout=5.0, near=IN_LINE
+                "advance",
+                lambda: self._tip(cut) - LAST_WAY * place.ahead,
+                speed=0.08 if place.cost > ENOUGH else 0.20,
+                timeout=5.0,
+                near=IN_LINE,
             )
-            speed = SLOW if place.cost > ENOUGH else 0.10
-            yield from self._move("advance", lambda: self._tip(cut), speed=speed, timeout=4.0, near=REACHED)
+            yield from self._move("advance", lambda: self._tip(cut), speed=self._speed(), timeout=4.0, near=REACHED)
         except TaskFailed:
             if not self._is_in_mouth(cut):
                 raise
@@ -290,11 +293,18 @@ class PruneCanes(Task):
 
     def _withdraw(self) -> Iterator[str]:
         """Draw the hand back the way it came; a hand that is held stays where it is."""
-        back = self.arm.tip_position - APPROACH * self._at.ahead
+        start = self.arm.tip_position
         try:
+            out = start - LAST_WAY * self._at.ahead
+            yield from self._move("back", lambda: out, speed=self._speed(), timeout=4.0, near=IN_LINE)
+            back = start - APPROACH * self._at.ahead
             yield from self._move("back", lambda: back, speed=0.25, timeout=4.0, near=0.04)
         except TaskFailed:
             return
+
+    def _speed(self) -> float:
+        """Returns the speed of the hand [m/s] while its bars are beside the cane."""
+        return SLOW if self._at.cost > ENOUGH else 0.10
 
     def _fold(self) -> Iterator[str]:
         """Bring the arm to its home posture, from which it reaches all cuts: an arm that has run into its joint limits
