@@ -72,6 +72,7 @@ def prune_one(seed: int, spurs: int) -> dict[str, Any]:
     robot.fit_cutters(physics)
     task = PruneCanes(physics, robot, stops)
     worst = np.zeros(int(model.nodes.bud.max()) + 1)
+    by_robot = np.zeros_like(worst)
     parted: set[int] = set()
     cane_of = model.canes.of_bodies(len(model.body_mass))
     while not task.is_done:
@@ -80,6 +81,8 @@ def prune_one(seed: int, spurs: int) -> dict[str, Any]:
         physics.step()
         if any(contact.body >= 0 for contact in physics.contacts):
             worst = np.maximum(worst, bud_forces(model, physics.state, physics.contacts))
+            mine = [contact for contact in physics.contacts if contact.actor == robot.name]
+            by_robot = np.maximum(by_robot, bud_forces(model, physics.state, mine))
         parted |= {int(cane_of[max(one.segment, one.body)]) for one in physics.detachments}
     kept = kept_buds(model, stops, rule.buds)
     wanted = {cut.cane for stop in stops for cut in stop.cuts}
@@ -92,6 +95,7 @@ def prune_one(seed: int, spurs: int) -> dict[str, Any]:
         "others_cut": len(parted - wanted - {-1}),
         "kept_buds": len(kept),
         "bud_forces": [round(float(force), 2) for force in worst[kept]],
+        "bud_forces_by_robot": [round(float(force), 2) for force in by_robot[kept]],
         "seconds": round(physics.time, 2),
     }
 

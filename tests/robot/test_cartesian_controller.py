@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 
 from tests.support.prioritized_ik import solve_prioritized_ik as reference
+from vinesim.client.tasks.pruning import ROW_DISTANCE
 from vinesim.core import frames
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.control.cartesian_controller import CartesianController, InverseKinematics, axes_of_pose
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.robot.tasks.mouth_place import TURNS
+from vinesim.robot.tasks.prune import APPROACH, IN_LINE, TURNED
 from vinesim.scene.builder import assemble
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -60,6 +63,35 @@ def test_a_hand_moves_on_a_line_within_its_speed():
     deviation = (points - start) - ((points - start) @ along)[:, None] * along
     assert np.linalg.norm(deviation, axis=1).max() < 0.01
     assert np.linalg.norm(np.diff(points, axis=0), axis=1).max() / 0.01 < 1.2 * 0.3
+
+
+@pytest.mark.parametrize("along", [0.25, 0.40])
+def test_from_its_home_posture_the_arm_turns_the_blades_down_in_all_directions_of_a_cut(along: float):
+    """The start of the way towards a cane at the distance from which a robot prunes."""
+    robot = Robot(RigidWorld(assemble([])), load_description("vinebot"), "anna")
+    hand = CartesianController(robot, "left")
+    cut = np.array([along, ROW_DISTANCE, 1.1])  # the tool is some 7 cm above the cut
+    for ahead in frames.rotate(frames.from_yaw(TURNS), np.array([0.0, 1.0, 0.0])):
+        moved(hand, cut - APPROACH * ahead, ahead, -UP, seconds=4.0)
+        axes = axes_of_pose(robot.frame_pose(hand.tool))
+        assert hand.distance_to(cut - APPROACH * ahead) < IN_LINE
+        assert axes[0] @ ahead > np.cos(TURNED)
+        assert axes[2] @ -UP > np.cos(TURNED)
+        fold(hand)
+
+
+def fold(hand: CartesianController) -> None:
+    """Bring the arm to its home posture."""
+    robot = hand.robot
+    for tick in range(500):
+        is_home = hand.move_home(1.0)
+        robot.control(0.01 * tick)
+        robot.rigid.predict()
+        robot.rigid.integrate()
+        if is_home:
+            break
+    np.testing.assert_allclose(robot.setpoint, robot.description.home, atol=1e-9)
+    hand.reset()
 
 
 def solve(

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import pathlib
+import sys
+from collections.abc import Iterator
 from typing import Annotated
 
 import typer
@@ -78,36 +81,47 @@ def demo(
       vinesim demo --job prune
       vinesim demo --job prune --see
     """
-    if job == "push":
-        from vinesim.cli.demo.push_demo import run_push
-        from vinesim.client.tasks.registry import validate_sight
+    with _without_summary():
+        if job == "push":
+            from vinesim.cli.demo.push_demo import run_push
+            from vinesim.client.tasks.registry import validate_sight
 
-        validate_sight(job, see)
-        code = run_push(
-            seconds=seconds or 20.0,
-            seed=seed,
-            scene=scene or "demo",
-            robot=robot or "vinebot",
-            device=device,
-            real_time_factor=real_time_factor,
-            headless=headless,
-            out=out,
-        )
-    else:
-        from vinesim.cli.demo.task_demo import run_job
-        from vinesim.client.tasks.harvesting import HarvestOptions
+            validate_sight(job, see)
+            code = run_push(
+                seconds=seconds or 20.0,
+                seed=seed,
+                scene=scene or "demo",
+                robot=robot or "vinebot",
+                device=device,
+                real_time_factor=real_time_factor,
+                headless=headless,
+                out=out,
+            )
+        else:
+            from vinesim.cli.demo.task_demo import run_job
+            from vinesim.client.tasks.harvesting import HarvestOptions
 
-        code = run_job(
-            job,
-            harvest=HarvestOptions.named(bunches, order),
-            see=see,
-            seconds=seconds,
-            seed=seed,
-            scene=scene,
-            robot=robot,
-            device=device,
-            real_time_factor=real_time_factor,
-            headless=headless,
-            out=out,
-        )
-    raise typer.Exit(code)
+            code = run_job(
+                job,
+                harvest=HarvestOptions.named(bunches, order),
+                see=see,
+                seconds=seconds,
+                seed=seed,
+                scene=scene,
+                robot=robot,
+                device=device,
+                real_time_factor=real_time_factor,
+                headless=headless,
+                out=out,
+            )
+        raise typer.Exit(code)
+
+
+@contextlib.contextmanager
+def _without_summary() -> Iterator[None]:
+    """Tell why there is no summary if Ctrl-C comes while programs still start, and the demo has nothing to sum up."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        print("vinesim: stopped before there was a result, so summary.json was not written", file=sys.stderr)
+        raise

@@ -32,8 +32,10 @@ ABOVE_BUD = 0.015
 """[m] Distance of a cut above the last bud that is kept. Handbooks ask for one to two centimetres; GUESSED."""
 CANES_OF_SPUR = 3
 """Largest number of canes on a spur; longer two-year wood is a fruiting cane."""
-ROW_DISTANCE = 0.80
-"""[m] Distance of the base's centre from the cane, across the row; the row is to the robot's left."""
+ROW_DISTANCE = 0.95
+"""[m] Distance of the base's centre from the cane, across the row; the row is to the robot's left. From here the arm of
+Vinebot reaches cuts 0.15 to 0.45 m ahead from all directions that are tried; from 0.80 m its elbow would bend too far
+for two of the seven."""
 CANE_AHEAD = 0.35
 """[m] Distance of the cane ahead of the base's centre, along the row."""
 ROW_ROOM = 0.42

@@ -17,14 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from vinesim.client.tasks.pruning import ABOVE_BUD, CANE_AHEAD, REMOVED_AT, ROW_DISTANCE, PruningRule, rating
+from vinesim.client.tasks.pruning import ABOVE_BUD, CANE_AHEAD, REMOVED_AT, PruningRule, rating
 from vinesim.client.tasks.start_poses import PlacementError, ground_clearance
 from vinesim.core import frames
 from vinesim.robot.control.waypoint_follower import WaypointFollower
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.mouth_place import KINDS, NEIGHBOURHOOD, SPACING, MouthPlace, Wood
 from vinesim.robot.tasks.pick_seen import look
-from vinesim.robot.tasks.prune import DOWN, CutResult, PruneCanes, PruneStop, WoodCut
+from vinesim.robot.tasks.prune import DOWN, MAX_TRIES, CutResult, PruneCanes, PruneStop, WoodCut
 from vinesim.robot.tasks.sight import CaneEyes, RowMap, SeenCane
 from vinesim.robot.tasks.task import TaskFailed
 from vinesim.scene.ids import Organ
@@ -35,6 +35,8 @@ from vinesim.world import Physics
 
 LOOK_SPACING = 0.3
 """[m] Distance along the row between the places from which the robot looks."""
+ROW_DISTANCE = 0.80
+"""[m] Distance of the base's centre from the row. The numbers of the detector are fitted to pictures from here."""
 GAZE_AHEAD = 0.25
 """[m] Distance along the row, ahead of the base, of the place at which it looks."""
 GAZE_ABOVE = 0.17
@@ -319,6 +321,21 @@ class PruneBySight(PruneCanes):
             )
             self._correct(cuts, self._eyes.canes(self.stretch.row).canes)
         self.results += results.values()
+
+    def _make(self, cut: WoodCut, place: MouthPlace) -> Iterator[str]:
+        """Make a cut from ``place``, from another direction if that is in vain."""
+        tried: list[np.ndarray] = []
+        while True:
+            try:
+                yield from self._try(cut, place)
+            except TaskFailed:
+                tried.append(place.ahead)
+                if len(tried) >= MAX_TRIES:
+                    raise
+                yield from self._withdraw()
+                place = self._plan(cut, tried)
+            else:
+                return
 
     def _correct(self, cuts: tuple[WoodCut, ...], canes: tuple[SeenCane, ...]) -> None:
         """Correct the places of cuts by what the robot sees now; where a cane is not seen again, its place remains."""

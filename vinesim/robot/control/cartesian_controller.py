@@ -163,6 +163,15 @@ class CartesianController:
         self._rates = self._rates + change / max(1.0, float((np.abs(change) / self._largest_change).max()))
         robot.command_position(now + dt * self._rates, self._joints)
 
+    def move_home(self, share: float) -> bool:
+        """Command the joints for one step towards the home posture, all with the same time to go and at most with
+        ``share`` of their largest velocities. Returns whether they are there."""
+        left = self._home - self.robot.setpoint[self._joints]
+        steps = float((np.abs(left) / (share * self._fastest)).max()) / self.robot.rigid.dt
+        self._rates[:] = 0.0
+        self.robot.command_position(self._home - left * (1.0 - 1.0 / max(steps, 1.0)), self._joints)
+        return steps <= 1.0
+
     def hold_position(self) -> None:
         """Command the joints to keep their present set-points, in a step in which the arm is not to move."""
         self._rates[:] = 0.0

@@ -46,8 +46,9 @@ BUD_ROOM = 0.011
 KINDS = ("bud", "stays", "rigid", "wire", "goes", "loose")
 """Kinds of wood: the buds that stay, what else of a cane stays, old wood, wires, canes that are to go, and pieces that
 are cut off but still hang."""
-TOUCH_COST = np.array([60.0, 6.0, 6.0, 1.0, 1.0, 0.1])
-"""[kind] Cost of a point that the hand touches. GUESSED"""
+TOUCH_COST = np.array([60.0, 6.0, 6.0, 1.0, 1.0, 1.0])
+"""[kind] Cost of a point that the hand touches. Loose pieces hang in ties and between wires, and hold the hand as well.
+GUESSED"""
 CATCH_COST = np.array([300.0, 300.0, 100.0, 100.0, 20.0, 5.0])
 """[kind] Cost of a point within the mouth. Old wood and wires block the blades. GUESSED"""
 CATCH_ROOM = np.array([0.006, 0.005, 0.006])

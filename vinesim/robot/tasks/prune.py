@@ -7,7 +7,7 @@ of canes are read from the physics in every step.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -41,14 +41,21 @@ SLOW = 0.03
 a step."""
 LAST_WAY = 0.05
 """[m] Length of the last part of the way, which begins when the hand has turned: the bars are beside the cane then."""
-TOUCH = 0.5
-"""[N] Force on a bud that stays at which the hand stops."""
+TOUCH = 1.0
+"""[N] Rise of the force on a bud that stays at which the hand stops, whether the hand or a cane that it pushes presses
+the bud."""
 IN_LINE = 0.008
 """[m] Distance from its start at which the straight motion towards the cane begins."""
 MAX_CLOSURES = 3
 """Number of times that the blades close for one cut."""
 MAX_TRIES = 2
-"""Number of directions from which one cut is tried."""
+"""Number of directions from which one cut is tried at one stop."""
+FOLDING_TIME = 4.0
+"""[s] Longest time for that. GUESSED"""
+MAX_FAILURES = 4
+"""Number of failures after which a cut is tried a last time. GUESSED"""
+FOLDING = 0.8
+"""Share of the largest joint velocities with which the arm returns to a known posture. GUESSED"""
 NEAR_STOP = 0.4
 """[m] Distance from a stop up to which its cuts are made from another one. GUESSED"""
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -94,6 +101,19 @@ class CutResult:
     seconds: float
     reason: str
     """Why it was not done; empty if it was."""
+
+
+@dataclasses.dataclass(eq=False)
+class _Waiting:
+    """A cut that is not made yet."""
+
+    stop: PruneStop
+    cut: WoodCut
+    tried: list[np.ndarray] = dataclasses.field(default_factory=list)
+    """Directions [3] that were in vain from the present stop."""
+    failures: int = 0
+    seconds: float = 0.0
+    """Time that was spent on it [s]."""
 
 
 class PruneCanes(Task):
@@ -151,38 +171,56 @@ class PruneCanes(Task):
         }
 
     def run(self) -> Iterator[str]:
-        """The task. A cut waits while a cane that is to be cut off would be in the mouth, too: it is made from a later
-        stop, as long as one is near enough. The task fails if a cut was not made."""
-        waiting: list[tuple[PruneStop, WoodCut]] = []
+        """The task. At each stop the cut with the most room comes first. A cut that fails is tried again from another
+        direction when the other cuts of the stop are made, then from the next stop if that is near enough. The task
+        fails if a cut was not made."""
+        waiting: list[_Waiting] = []
         for number, stop in enumerate(self.stops):
             yield from self._go_to(stop.base_pose)
+            waiting += [_Waiting(stop, cut) for cut in stop.cuts]
             after = self.stops[number + 1] if number + 1 < len(self.stops) else None
-            for one in [*waiting, *((stop, cut) for cut in stop.cuts)]:
-                can_wait = after is not None and _apart(one[0], after) < NEAR_STOP
-                place = self._plan(one[1])
-                if can_wait and place.catches:
-                    if one not in waiting:
-                        waiting.append(one)
-                    continue
-                if one in waiting:
-                    waiting.remove(one)
-                yield from self._record(one[1], place)
+            waiting = yield from self._prune_from_here(waiting, after)
         missed = [one for one in self.results if not one.done]
         if missed:
             raise TaskFailed(f"{len(missed)} of {len(self.results)} cuts were not made; the first: {missed[0].reason}")
 
-    def _record(self, cut: WoodCut, place: MouthPlace) -> Iterator[str]:
-        """Make a cut from ``place``, draw the hand back, and add what became of it to the results."""
-        start = self.time
-        off = float("nan")
-        reason = ""
-        try:
-            yield from self._make(cut, place)
-            off = self._error(cut)
-        except TaskFailed as failure:
-            reason = f"{self.phase}: {failure}"
-        yield from self._withdraw()
-        self.results.append(CutResult(cut.cane, cut.is_kept, not reason, off, round(self.time - start, 2), reason))
+    def _prune_from_here(
+        self, waiting: list[_Waiting], after: PruneStop | None
+    ) -> Generator[str, None, list[_Waiting]]:
+        """Make cuts from the present place of the base. Returns those that wait for the stop ``after``: a cane that is
+        to be cut off would be in the mouth, too, or the cut has failed."""
+        left: list[_Waiting] = []
+        here = list(waiting)
+        for one in here:
+            one.tried.clear()
+        while here:
+            places = [self._plan(one.cut, one.tried) for one in here]
+            easiest = min(range(len(here)), key=lambda row: (len(here[row].tried), places[row].cost))
+            one = here.pop(easiest)
+            place = places[easiest]
+            can_wait = after is not None and _apart(one.stop, after) < NEAR_STOP and one.failures < MAX_FAILURES
+            if can_wait and (place.catches or len(one.tried) >= MAX_TRIES):
+                left.append(one)
+                continue
+            start = self.time
+            reason = ""
+            try:
+                yield from self._try(one.cut, place)
+            except TaskFailed as failure:
+                reason = f"{self.phase}: {failure}"
+            yield from self._withdraw()
+            if reason:
+                yield from self._fold()
+            one.seconds += self.time - start
+            if reason and one.failures < MAX_FAILURES:
+                one.failures += 1
+                one.tried.append(place.ahead)
+                here.append(one)
+                continue
+            cut = one.cut
+            off = float("nan") if reason else self._error(cut)
+            self.results.append(CutResult(cut.cane, cut.is_kept, not reason, off, round(one.seconds, 2), reason))
+        return left
 
     def _go_to(self, place: np.ndarray) -> Iterator[str]:
         """Drive along the row to a pose [7] of the base."""
@@ -191,41 +229,31 @@ class PruneCanes(Task):
             return
         follower = WaypointFollower(self.robot, place[None, :2], frames.to_yaw(place[3:]), speed=0.3)
         while not follower.is_done:
-            self.arm.hold_position()
+            self.arm.move_home(FOLDING)
             follower.control(self.time)
             if follower.is_stuck:
                 raise TaskFailed("the base is stuck")
             yield "go"
-
-    def _make(self, cut: WoodCut, place: MouthPlace) -> Iterator[str]:
-        """Make a cut from ``place``, from another direction if that is in vain."""
-        tried: list[np.ndarray] = []
-        while True:
-            try:
-                yield from self._try(cut, place)
-            except TaskFailed:
-                tried.append(place.ahead)
-                if len(tried) >= MAX_TRIES:
-                    raise
-                yield from self._withdraw()
-                place = self._plan(cut, tried)
-            else:
-                return
 
     def _try(self, cut: WoodCut, place: MouthPlace) -> Iterator[str]:
         """Bring the mouth around the cane and close it."""
         self.robot.command_gripper(self.arm.gripper, OPENING)
         self._at = place
         self._focus = self._place(cut)
-        yield from self._move(
-            "reach", lambda: self._tip(cut) - APPROACH * self._at.ahead, speed=0.35, timeout=10.0, near=IN_LINE
-        )
+        try:
+            yield from self._reach(cut)
+        except TaskFailed:
+            yield from self._fold()
+            yield from self._reach(cut)
         try:
             yield from self._move(
-                "advance", lambda: self._tip(cut) - LAST_WAY * place.ahead, speed=0.20, timeout=5.0, near=IN_LINE
+                "advance",
+                lambda: self._tip(cut) - LAST_WAY * place.ahead,
+                speed=0.08 if place.cost > ENOUGH else 0.20,
+                timeout=5.0,
+                near=IN_LINE,
             )
-            speed = SLOW if place.cost > ENOUGH else 0.10
-            yield from self._move("advance", lambda: self._tip(cut), speed=speed, timeout=4.0, near=REACHED)
+            yield from self._move("advance", lambda: self._tip(cut), speed=self._speed(), timeout=4.0, near=REACHED)
         except TaskFailed:
             if not self._is_in_mouth(cut):
                 raise
@@ -245,6 +273,12 @@ class PruneCanes(Task):
             f"the blades did not cut the cane: its wood needs {strongest:.0f} N, 0: it is not in the mouth"
         )
 
+    def _reach(self, cut: WoodCut) -> Iterator[str]:
+        """Bring the hand, turned, to the start of the straight motion towards the cane."""
+        yield from self._move(
+            "reach", lambda: self._tip(cut) - APPROACH * self._at.ahead, speed=0.35, timeout=4.0, near=IN_LINE
+        )
+
     def _plan(self, cut: WoodCut, tried: Sequence[np.ndarray] = ()) -> MouthPlace:
         """Returns how the mouth takes a cane, among the wood around it as it is now."""
         wood = self._wood.around(self.physics.state, self._pose(cut), cut.cane, self._kept)
@@ -259,11 +293,25 @@ class PruneCanes(Task):
 
     def _withdraw(self) -> Iterator[str]:
         """Draw the hand back the way it came; a hand that is held stays where it is."""
-        back = self.arm.tip_position - APPROACH * self._at.ahead
+        start = self.arm.tip_position
         try:
+            out = start - LAST_WAY * self._at.ahead
+            yield from self._move("back", lambda: out, speed=self._speed(), timeout=4.0, near=IN_LINE)
+            back = start - APPROACH * self._at.ahead
             yield from self._move("back", lambda: back, speed=0.25, timeout=4.0, near=0.04)
         except TaskFailed:
             return
+
+    def _speed(self) -> float:
+        """Returns the speed of the hand [m/s] while its bars are beside the cane."""
+        return SLOW if self._at.cost > ENOUGH else 0.10
+
+    def _fold(self) -> Iterator[str]:
+        """Bring the arm to its home posture, from which it reaches all cuts: an arm that has run into its joint limits
+        with its elbow on the wrong side would stay there."""
+        end = self.time + FOLDING_TIME
+        while self.time < end and not self.arm.move_home(FOLDING):
+            yield "fold"
 
     def _move(
         self, phase: str, goal: Callable[[], np.ndarray], *, speed: float, timeout: float, near: float
@@ -271,13 +319,14 @@ class PruneCanes(Task):
         """Move the hand to ``goal`` [3] m in the world with its blades down."""
         end = self.time + timeout
         self.arm.reset()
+        at_rest = self._bud_forces()  # canes lie on each other and on wires
         while True:
             there = goal()
             axes = axes_of_pose(self.robot.frame_pose(self.arm.tool))
             off = float(np.arccos(np.clip((axes[0] @ self._at.ahead + axes[2] @ DOWN) / 2.0, -1.0, 1.0)))
-            if self.arm.distance_to(there) < near and (off < TURNED or phase != "advance"):
+            if self.arm.distance_to(there) < near and (off < TURNED or phase == "back"):
                 return
-            if phase == "advance" and self._bud_force() > TOUCH:
+            if phase == "advance" and (self._bud_forces() > at_rest + TOUCH).any():
                 raise TaskFailed("a bud that stays is touched")
             if self.time > end:
                 raise TaskFailed(
@@ -303,13 +352,13 @@ class PruneCanes(Task):
             found.append(nodes.bud[(nodes.cane == cut.cane) & (nodes.bud >= 0) & before])
         return np.concatenate(found)
 
-    def _bud_force(self) -> float:
-        """Returns the largest force [N] on a bud that stays, in the last step."""
+    def _bud_forces(self) -> np.ndarray:
+        """Returns the force [k] N on each bud that stays, in the last step."""
         physics = self.physics
         touching = [one for one in physics.contacts if one.body >= 0]
         if not touching or not len(self._kept_buds):
-            return 0.0
-        return float(bud_forces(physics.model, physics.state, touching)[self._kept_buds].max())
+            return np.zeros(len(self._kept_buds))
+        return bud_forces(physics.model, physics.state, touching)[self._kept_buds]
 
     def _tip(self, cut: WoodCut) -> np.ndarray:
         """Returns the place [3] m of the tool at which the cut is in the mouth."""
