@@ -322,7 +322,7 @@ def test_touched_trees_are_exchanged_near_and_not_far(server):
         ZenohBus("bob", connect=server.endpoint) as b,
     ):
         ada = Client(a, 1.0)
-        bob = Client(b, 60.0)
+        bob = Client(b, 20.0)
         ticking = ticking_all(ada, bob)
         wait(ticking(lambda: "bob" in ada.robots and "ada" in bob.robots), "both to see each other")
         wait(ticking(lambda: abs(ada.replicator.offset + time.monotonic() - time.time()) < 0.1), "the server's clock")
