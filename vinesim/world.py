@@ -7,6 +7,7 @@ the new state decides which bunches and pieces of wood detach, and which trees f
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -48,6 +49,10 @@ from vinesim.wind.plant_wind import WindOnPlants
 from vinesim.wires.deflected_wires import DeflectedWires
 from vinesim.wires.elastic_supports import ElasticSupports
 from vinesim.wires.wire_segments import WireShapes
+
+ROCKING_TIME = 0.3
+"""[s] Time constant with which cut wood on the ground, a wire or a post stops to turn. GUESSED: contacts have no
+resistance to rolling, and a bent cane that lies on two points would rock for minutes."""
 
 
 class Physics:
@@ -187,6 +192,8 @@ class Physics:
 
     def _integrate_plants(self) -> None:
         self.plants.integrate(self.contact_solver.bodies, self.contact_solver.wrenches)
+        if self.contact_solver.count and self.plants.state.body_cut.any():
+            self.plants.slow_turning(self.contact_solver.lying_bodies, math.exp(-self.dt / ROCKING_TIME))
         if len(self.plants.awake):
             self._body_q = None
             self._kinematics_current = False

@@ -251,6 +251,17 @@ class ContactSolver:
         return self._rigid_arrays.listed.actor[other], self._rigid_arrays.listed.link[other]
 
     @property
+    def lying_bodies(self) -> np.ndarray:
+        """Plant bodies [k] that pressed on the ground, a post, a wire or other static geoms in the last step; a body
+        may be listed several times."""
+        contacts = self.impulses.contacts
+        other = contacts.other[: self.count]
+        if self._rigid_arrays is None:
+            return contacts.body[:0]
+        presses = (other >= self._rigid_arrays.movable) & contacts.force[: self.count].any(1)
+        return contacts.body[: self.count][presses]
+
+    @property
     def geom_bodies(self) -> np.ndarray:
         """[geom] MuJoCo bodies of the geoms by which contacts of the last step refer to their other side."""
         return np.zeros(0, int) if self._rigid_arrays is None else self._rigid_arrays.listed.body

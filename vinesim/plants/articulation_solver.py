@@ -642,6 +642,12 @@ class ArticulationSolver:
         self.buffers.synchronize()
         self.tick += 1
 
+    def slow_turning(self, bodies: np.ndarray, share: float) -> None:
+        """Between steps: multiply the angular velocities of the cut-off parts to which ``bodies`` [k] belong by
+        ``share``. Bodies that are not cut off stay as they are."""
+        roots = np.unique(self._root[bodies])
+        self.state.joint_qd[roots[roots >= 0]] *= share
+
     def fastest_rate(self) -> float:
         """Returns the largest entry of :attr:`tree_rate` after the last ``integrate()``, or an upper bound of that
         entry; infinity if an entry is NaN."""
