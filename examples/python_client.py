@@ -15,7 +15,7 @@ with (
         ada.run(0.02)
         bob.run(0.02)
     start = bob.actor_pose("ada")[:2]
-    for _ in range(100):
+    for _ in range(200):
         ada.robot.command_base(0.3, 0.0, ada.time)
         ada.run(0.01)
         bob.step()

@@ -77,5 +77,5 @@ def test_dataset(tmp_path):
 
 def test_python_client(tmp_path):
     way, present = re.search(r"ada drive (\d+) cm; present: (.*)$", run("python_client.py", tmp_path)).groups()
-    assert 15 <= int(way) <= 35
+    assert 25 <= int(way) <= 60
     assert present == "bob, ada"
