@@ -35,7 +35,7 @@ pytestmark = pytest.mark.slow
 BUNCH = 10
 BOX = 0
 BOX_PLACE = np.array([-2.4, -0.7, 0.0])
-HANDED_OVER_FROM = BOX_PLACE[:2] + np.array([0.0, 0.5])
+HANDED_OVER_FROM = BOX_PLACE[:2] + np.array([0.0, 0.6])
 POINTS_FROM = 1.15
 PICKS_FROM = 0.75
 """Distances of the first person from the bunch [m]."""
@@ -270,19 +270,26 @@ def meet(tmp_path):
         for client in meeting.clients.values():
             wait(lambda client=client: not client.physics.state.bunch_attached[BUNCH], f"{client.name} knows of it")
 
-        # she brings it to ben's box, holds it still and opens her hand
+        # she brings it to ben's box, steps to where it hangs over the box, holds it still and opens her hand
         walk_to(a, *HANDED_OVER_FROM)
         point_at(a, HAND)
         seen: list[tuple[int, np.ndarray]] = []
 
-        def is_still_over_box() -> bool:
+        def off_box() -> np.ndarray:
+            return (seen[-1][1] - BOX_PLACE)[:2]
+
+        def is_still() -> bool:
             physics = meeting.ben.physics
             here = physics.tick, meeting.middle(physics.rigid.bunch_pose(BUNCH))
             seen.append(here)
             before = next((place for tick, place in reversed(seen) if tick <= here[0] - STILL), None)
-            is_over = bool((np.abs(here[1] - BOX_PLACE)[:2] < 0.1).all())
-            return is_over and before is not None and float(np.linalg.norm(here[1] - before)) < 0.01
+            return before is not None and float(np.linalg.norm(here[1] - before)) < 0.01
 
+        def is_still_over_box() -> bool:
+            return is_still() and bool((np.abs(off_box()) < 0.1).all())
+
+        wait(lambda: is_still() and np.linalg.norm(off_box()) < 0.4, "ben's client has the bunch still near his box")
+        walk_to(a, *(HANDED_OVER_FROM - off_box()))
         wait(is_still_over_box, "ben's client has the bunch still over his box")
         tap(a, "Space")
         for client in meeting.clients.values():
