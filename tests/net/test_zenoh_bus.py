@@ -675,7 +675,7 @@ def test_all_links_resume_after_a_server_restart(protocols, tmp_path):
 
 
 def test_a_thread_of_zenoh_keeps_its_python_state_between_messages():
-    """Making one for each message takes two thirds of what a message costs."""
+    """Making a Python thread state for each message takes two thirds of the time of a message."""
     local = threading.local()
     seen: list[tuple[int, bool]] = []
 

@@ -335,7 +335,7 @@ def test_a_person_takes_leaves_off_ties_and_unties_what_is_at_the_right_hand_onc
     turn = (0.0, 0.0, 0.0, 1.0)
 
     def told(palm, *work):
-        """What a page is told after it has sent wishes, each in two messages."""
+        """Returns what the page is told about work, after it has sent each wish in two messages."""
         x, y, z = palm
         head = (x - 0.4, y, 1.6, *turn)
         for wish in work or (None,):

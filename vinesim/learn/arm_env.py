@@ -45,7 +45,7 @@ class ArmEnv(TaskEnv):
         device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
         arrays: ``"numpy"``, ``"torch"`` or ``"warp"``; see :class:`~vinesim.learn.task_env.TaskEnv`, which also
             describes ``info`` and errors.
-        vines_seed: seed of what differs between worlds, which stays the same after a reset.
+        vines_seed: seed of the differences between worlds; the differences stay the same after a reset.
         variation: ranges of these numbers, or a TOML file with them.
         max_episode_steps: number of actions after which an episode is truncated.
     """
