@@ -335,7 +335,7 @@ def test_a_person_takes_leaves_off_ties_and_unties_what_is_at_the_right_hand_onc
     turn = (0.0, 0.0, 0.0, 1.0)
 
     def told(palm, *work):
-        """Returns what the page is told about work, after it has sent each wish in two messages."""
+        """Sends each wish in two messages; returns the answers about work in the next state for the page."""
         x, y, z = palm
         head = (x - 0.4, y, 1.6, *turn)
         for wish in work or (None,):

@@ -161,7 +161,7 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode in all worlds; see :class:`gymnasium.vector.VectorEnv`. ``seed``: of what is drawn."""
+        """Begin an episode in all worlds; see :class:`gymnasium.vector.VectorEnv`. ``seed``: seed of random numbers."""
         if isinstance(seed, list):
             raise ValueError("seed: give one number for all worlds")
         super().reset(seed=seed)
