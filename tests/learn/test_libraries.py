@@ -24,6 +24,7 @@ def test_without_the_library_the_message_says_what_to_install(module: str, libra
         importlib.import_module(f"vinesim.learn.{module}")
 
 
+@pytest.mark.gpu
 def test_stable_baselines3_gets_last_observations_and_time_limits() -> None:
     pytest.importorskip("stable_baselines3")
     from vinesim.learn.stable_baselines import StableBaselinesEnv
@@ -44,6 +45,7 @@ def test_stable_baselines3_gets_last_observations_and_time_limits() -> None:
         StableBaselinesEnv(ReachEnv(1, arrays="warp"))
 
 
+@pytest.mark.gpu
 def test_rsl_rl_gets_time_outs_and_sets_the_ages_of_episodes() -> None:
     pytest.importorskip("rsl_rl")
     torch = pytest.importorskip("torch")
