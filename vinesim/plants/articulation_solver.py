@@ -22,7 +22,7 @@ import logging
 import math
 import weakref
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -88,6 +88,22 @@ _COUNTS = 9
 _log = logging.getLogger(__name__)
 _NO_TREES = np.zeros(0, np.int32)
 _NO_WRENCHES = np.zeros((0, 6), np.float32)
+
+
+def _launch_nothing() -> None:
+    pass
+
+
+class Beside(NamedTuple):
+    """Launches of others that neither read nor write what the trees do in the same half of a step."""
+
+    predict: Callable[[], None]
+    """Launches what runs beside the prediction of the trees."""
+    integrate: Callable[[], None]
+    """Launches what runs beside their integration."""
+
+
+_NOTHING_BESIDE = Beside(_launch_nothing, _launch_nothing)
 
 
 class ArticulationSolver:
@@ -673,9 +689,12 @@ class ArticulationSolver:
         roots = self._falling_roots[self.state.tree_awake[tree] & np.isin(tree, self._runner.stepped)]
         return self.buffers.slots[roots], self.model.body_tree[roots]
 
-    def advance(self, steps: int, between: Callable[[], None] | None = None) -> None:
+    def advance(
+        self, steps: int, between: Callable[[], None] = _launch_nothing, beside: Beside = _NOTHING_BESIDE
+    ) -> None:
         """Take many steps of the awake trees without sleep and fault guard. ``between`` launches the kernels that run
-        between prediction and integration, such as contacts.
+        between prediction and integration, such as contacts. ``beside``: what a GPU does at the same time as prediction
+        and integration, such as the steps of rigid bodies.
 
         A GPU works on its own copies of all arrays: call :meth:`upload` after each change of an array on the host, and
         :meth:`download` after the steps. During the steps nothing is copied between host and GPU. Afterwards
@@ -689,9 +708,9 @@ class ArticulationSolver:
             self._load(_NO_TREES, _NO_WRENCHES)
             self._runner.integrate(_NO_TREES, *floating)
             self.buffers.synchronize()
-            self._runner.advance(steps - 1, *floating, between)
+            self._runner.advance(steps - 1, *floating, between, beside)
         else:
-            self._runner.advance(steps, *floating, between)
+            self._runner.advance(steps, *floating, between, beside)
         self.tick += steps
 
     def upload(self) -> None:
@@ -2354,10 +2373,14 @@ class StepRunner:
     # ------------------------------------------------------------------ many steps
 
     def advance(
-        self, steps: int, roots: np.ndarray, root_trees: np.ndarray, between: Callable[[], None] | None = None
+        self,
+        steps: int,
+        roots: np.ndarray,
+        root_trees: np.ndarray,
+        between: Callable[[], None],
+        beside: Beside,
     ) -> None:
-        """Predict and integrate ``steps`` times without transfers to the host. ``between`` launches kernels between
-        each prediction and its integration."""
+        """Predict and integrate ``steps`` times without transfers to the host, as the solver's method of this name."""
         self._divide(np.zeros(0, np.int32))
         self._list_roots(roots, root_trees)
         if len(self.stepped) == 0:
@@ -2369,25 +2392,44 @@ class StepRunner:
             self._launches.upload_trees()
             self.uploaded = counts
         if not self._buffers.device.is_cpu:
-            what = (self._whole_groups, self._room, len(self._levels), self._kind, between)
+            what = (self._whole_groups, self._room, len(self._levels), self._kind, between, beside)
             if self._graph is None or self._graph_of != what:
                 with wp.ScopedCapture(self._buffers.device) as capture:
-                    self._steps(1, between)
+                    self._step_beside(between, beside)
                 self._graph, self._graph_of = capture.graph, what
             for _ in range(steps):
                 wp.capture_launch(self._graph)  # pyright: ignore[reportArgumentType]  (captured above)
         else:
-            self._steps(steps, between)
+            self._steps(steps, between, beside)
         self._launches.download_trees()
         self._buffers.synchronize()
 
-    def _steps(self, steps: int, between: Callable[[], None] | None) -> None:
+    def _steps(self, steps: int, between: Callable[[], None], beside: Beside) -> None:
         step = self._launches.resident
         for _ in range(steps):
             step.predict(self._whole_groups)
-            if between is not None:
-                between()
+            beside.predict()
+            between()
             self._integrate(step)
+            beside.integrate()
+
+    def _step_beside(self, between: Callable[[], None], beside: Beside) -> None:
+        """Launch a step on a GPU, whose second stream has the trees.
+
+        The other launches stay on the stream that is being captured, where alone Warp allows graphs with conditions.
+        """
+        step = self._launches.resident
+        stream = self._buffers.device.stream
+        trees = wp.Stream(self._buffers.device)
+        with wp.ScopedStream(trees):  # waits for the stream
+            step.predict(self._whole_groups)
+        beside.predict()
+        stream.wait_stream(trees)
+        between()
+        with wp.ScopedStream(trees):
+            self._integrate(step)
+        beside.integrate()
+        stream.wait_stream(trees)
 
 
 def _levels(steps: np.ndarray) -> Levels:

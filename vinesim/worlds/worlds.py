@@ -17,7 +17,7 @@ import warp as wp
 
 from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.worlds.reset import find_faults, forget_faults, restore_rows, restore_worlds
-from vinesim.plants.articulation_solver import TREE_RESULTS, ArticulationSolver
+from vinesim.plants.articulation_solver import TREE_RESULTS, ArticulationSolver, Beside
 from vinesim.rigid.rigid_world import MAX_RATE, RigidWorld
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
@@ -161,15 +161,12 @@ class Worlds:
 
     def step(self, steps: int = 1) -> None:
         """Advance all worlds by ``steps`` steps."""
-        self.plants.advance(steps, self._between)
+        self.plants.advance(steps, self.contacts.solve, Beside(self._predict_bodies, self.bodies.integrate))
         self._check()
 
-    def _between(self) -> None:
-        """Launch what happens between the prediction and the integration of the plants."""
+    def _predict_bodies(self) -> None:
         self._check()  # of the step before
         self.bodies.predict()
-        self.contacts.solve()
-        self.bodies.integrate()
 
     def download(self) -> None:
         """Copy the states of all plants to the host: afterwards ``plants.state`` holds their poses."""
