@@ -30,7 +30,7 @@ SPEED = 1.0
 LEAD = 0.3
 """[rad] Largest distance of a joint's target from the joint."""
 VARIANTS = 64
-"""Number of different groups of shoots; further worlds repeat them."""
+"""Default for the number of different groups of plants; further worlds repeat them."""
 Plants = Callable[[np.random.Generator, Variation], Model]
 
 
@@ -46,6 +46,7 @@ class ArmEnv(TaskEnv):
         arrays: ``"numpy"``, ``"torch"`` or ``"warp"``; see :class:`~vinesim.learn.task_env.TaskEnv`, which also
             describes ``info`` and errors.
         vines_seed: seed of the differences between worlds; the differences stay the same after a reset.
+        vines: number of different groups of plants; further worlds repeat them.
         variation: ranges of these numbers, or a TOML file with them.
         max_episode_steps: number of actions after which an episode is truncated.
     """
@@ -59,6 +60,7 @@ class ArmEnv(TaskEnv):
         device: str = "cpu",
         arrays: str = "numpy",
         vines_seed: int = 0,
+        vines: int = VARIANTS,
         variation: Variation | str | pathlib.Path = Variation(),
         max_episode_steps: int = MAX_EPISODE_STEPS,
         render_mode: str | None = None,
@@ -66,7 +68,7 @@ class ArmEnv(TaskEnv):
         check_options(num_envs, arrays, render_mode)
         ranges = as_variation(variation)
         variants = [
-            plants(np.random.default_rng([vines_seed, number]), ranges) for number in range(min(num_envs, VARIANTS))
+            plants(np.random.default_rng([vines_seed, number]), ranges) for number in range(min(num_envs, vines))
         ]
         super().__init__(
             Worlds(plants_of_worlds(variants, num_envs), num_envs, robots=[arm(BASE, HOME)], device=device),
@@ -75,7 +77,7 @@ class ArmEnv(TaskEnv):
             device=device,
             arrays=arrays,
             variation=ranges,
-            rng=np.random.default_rng([vines_seed, VARIANTS]),
+            rng=np.random.default_rng([vines_seed, vines]),
             max_episode_steps=max_episode_steps,
             render_mode=render_mode,
         )
