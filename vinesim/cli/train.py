@@ -97,7 +97,7 @@ def run_evaluation(
     if out is not None:
         raise UsageError(f"--out {out} with --evaluate {file}: an evaluation writes no files; leave --out out")
     _check(task, device)
-    from vinesim.learn.evaluate import evaluate
+    from vinesim.learn.evaluate import evaluate, evaluate_with_full_physics
     from vinesim.learn.policy import load_policy
     from vinesim.learn.variation import Variation
 
@@ -105,7 +105,12 @@ def run_evaluation(
     if policy.task != task:
         raise UsageError(f"{file} is a policy for {policy.task}; run: vinesim train {policy.task} --evaluate {file}")
     ranges = variation or Variation()
-    result = evaluate(policy, worlds or EVALUATION_WORLDS, seed=seed, device=device, variation=ranges)
+    if full and (task != "reach" or device != "cpu"):
+        raise UsageError(f"--full-physics with task {task} and --device {device}: it has reach, on the cpu")
+    if full:
+        result = evaluate_with_full_physics(policy, worlds or FULL_PHYSICS_WORLDS, seed=seed, variation=ranges)
+    else:
+        result = evaluate(policy, worlds or EVALUATION_WORLDS, seed=seed, device=device, variation=ranges)
     print(result.line())
     return 0
 

@@ -5,13 +5,22 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import pathlib
+from collections.abc import Callable
 
 import numpy as np
+import warp as wp
+from gymnasium.utils.seeding import np_random
 
+from vinesim.kernels.learn.episodes import draw_targets
 from vinesim.learn import TASKS
-from vinesim.learn.arm_env import ArmEnv
+from vinesim.learn.arm import AXES, arm
+from vinesim.learn.arm_env import BASE, HOME, MAX_EPISODE_STEPS, ArmEnv
+from vinesim.learn.pilot import ReachPilot
 from vinesim.learn.policy import Policy, PolicyError
-from vinesim.learn.variation import Variation
+from vinesim.learn.reach import NUMBERS, SHOOTS, plants
+from vinesim.learn.task_env import STEPS
+from vinesim.learn.variation import Variation, as_variation
+from vinesim.world import Physics
 
 UNSEEN = 2**31
 """Seed of vines from which on they are for evaluations. Those of trainings have smaller seeds."""
@@ -39,7 +48,7 @@ class Evaluation:
         return f"{TASKS[self.task]} {self.successes} of {self.worlds} ({100.0 * self.successes / self.worlds:.1f} %)"
 
 
-def environment(task: str) -> type[ArmEnv]:
+def environment(task: str) -> Callable[..., ArmEnv]:
     """Returns the class of a task of :data:`vinesim.learn.TASKS`. Raises :class:`ValueError` for another name."""
     if task not in TASKS:
         raise ValueError(f"task {task!r}: give one of {', '.join(TASKS)}")
@@ -64,7 +73,7 @@ def evaluate(
     env = environment(policy.task)(
         worlds, device=device, vines_seed=UNSEEN + seed, vines=worlds, variation=variation
     )  # fmt: skip
-    check_numbers(policy, env)
+    policy.check_numbers(env.num_observations, env.num_actions)
     observation, _ = env.reset(seed=seed)
     going = np.ones(worlds, bool)
     success = np.zeros(worlds, bool)
@@ -83,11 +92,48 @@ def evaluate(
     return Evaluation(policy.task, worlds, successes, faults, actions / max(successes, 1))
 
 
-def check_numbers(policy: Policy, env: ArmEnv) -> None:
-    """Raise :class:`~vinesim.learn.policy.PolicyError` unless a policy has as many inputs and outputs as a task."""
-    numbers = env.single_observation_space.shape or ()
-    if (policy.inputs,) != numbers or policy.outputs != env.num_actions:
-        raise PolicyError(
-            f"the policy maps {policy.inputs} numbers to {policy.outputs}, task {policy.task} has {numbers[0]} and "
-            f"{env.num_actions}; train it again"
-        )
+def evaluate_with_full_physics(
+    policy: Policy, worlds: int = 100, *, seed: int = 1, variation: Variation | str | pathlib.Path = Variation()
+) -> Evaluation:
+    """Returns how a policy for *reach* does with the physics of a client, one world after the other.
+
+    Vines and wanted bunches are those of the first ``worlds`` worlds of :func:`evaluate` with the same ``seed``. In
+    these worlds plants touch each other, break and sleep, and arms deform; a fault is a robot or a tree that was
+    stopped. Raises :class:`~vinesim.learn.policy.PolicyError` as :func:`evaluate` does, and :class:`ValueError` for
+    another task, and for a variation of friction or delay, which only batches have.
+    """
+    ranges = as_variation(variation)
+    if policy.task != "reach":
+        raise ValueError(f"full physics with task {policy.task}: there is only reach")
+    if ranges.friction != (1.0, 1.0) or ranges.delay != (0, 0):
+        raise ValueError("full physics with a variation of friction or delay: only batches have it; leave both out")
+    policy.check_numbers(NUMBERS, len(AXES))
+    successes = faults = actions = 0
+    for number, wanted in enumerate(wanted_bunches(worlds, seed)):
+        physics = Physics(plants(np.random.default_rng([UNSEEN + seed, number]), ranges))
+        physics.add_robot(arm(BASE, HOME))
+        pilot = ReachPilot(physics, policy, int(wanted))
+        for k in range(MAX_EPISODE_STEPS):
+            pilot.act()
+            for _ in range(STEPS):
+                physics.step()
+            pilot.look()
+            if physics.faults["robots_stopped"] or physics.faults["trees_stopped"]:
+                faults += 1
+                break
+            if pilot.has_reached:
+                successes += 1
+                actions += k + 1
+                break
+    return Evaluation(policy.task, worlds, successes, faults, actions / max(successes, 1))
+
+
+def wanted_bunches(worlds: int, seed: int) -> np.ndarray:
+    """Returns the numbers [world] of the bunches that a batch of :class:`~vinesim.learn.reach.ReachEnv` wants in its
+    first episodes after ``reset(seed=seed)``."""
+    rng, _ = np_random(seed)
+    begins = wp.full(worlds, True, dtype=wp.bool, device="cpu")
+    drawn = wp.array([rng.integers(2**31)], dtype=wp.int32, device="cpu")
+    episode, wanted = (wp.zeros(worlds, dtype=wp.int32, device="cpu") for _ in range(2))
+    wp.launch(draw_targets, worlds, [SHOOTS, drawn, begins], [episode, wanted], device="cpu")
+    return wanted.numpy()

@@ -90,6 +90,14 @@ class Policy:
             x = ACTIVATIONS[self.activation](x @ weight.T + bias)
         return np.clip(x @ self.weights[-1].T + self.biases[-1], -1.0, 1.0).astype(np.float32)
 
+    def check_numbers(self, inputs: int, outputs: int) -> None:
+        """Raise :class:`PolicyError` unless observations have ``inputs`` components, and actions ``outputs``."""
+        if (self.inputs, self.outputs) != (inputs, outputs):
+            raise PolicyError(
+                f"the policy maps {self.inputs} numbers to {self.outputs}, task {self.task} has {inputs} and "
+                f"{outputs}; train it again"
+            )
+
     def save(self, path: str | pathlib.Path) -> None:
         """Write the policy into an .npz file. Raises :class:`~vinesim.core.errors.WriteError`."""
         layers = {f"weight_{i}": weight for i, weight in enumerate(self.weights)}

@@ -87,6 +87,7 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         self.num_envs = worlds.count
         self.render_mode = None
         self.num_actions = actions
+        self.num_observations = numbers
         self.max_episode_steps = max_episode_steps
         self.arrays = arrays
         self.device = device

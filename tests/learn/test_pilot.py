@@ -1,0 +1,65 @@
+"""A policy in the physics of a client, compared with the same policy in a batch."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("gymnasium")
+pytest.importorskip("mujoco_warp")
+from tests.learn.arm_control import towards
+from vinesim.learn.arm import arm
+from vinesim.learn.arm_env import BASE, HOME
+from vinesim.learn.evaluate import UNSEEN, evaluate, evaluate_with_full_physics, wanted_bunches
+from vinesim.learn.pilot import ReachPilot
+from vinesim.learn.policy import Policy, PolicyError
+from vinesim.learn.reach import NUMBERS, ReachEnv, plants
+from vinesim.learn.variation import Variation
+from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.world import Physics
+
+pytestmark = pytest.mark.slow
+
+
+class Given:
+    """A stand-in for a policy that returns :attr:`action`."""
+
+    def check_numbers(self, inputs: int, outputs: int) -> None:
+        assert (inputs, outputs) == (NUMBERS, 7)
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        return self.action
+
+
+def test_a_client_and_a_batch_observe_and_act_alike() -> None:
+    """The hand goes to the bunch of another shoot and pushes it. Both sides have whole bunches, awake plants and no
+    contacts between plants."""
+    policy = Given()
+    env = ReachEnv(1, vines_seed=UNSEEN)
+    observation, _ = env.reset(seed=3)
+    wanted = int(np.argmax(observation[0, -4:]))
+    assert wanted_bunches(1, 3).tolist() == [wanted]
+    parameters = PhysicsParameters(sleep=False, bunch_pool_size=0)
+    physics = Physics(plants(np.random.default_rng([UNSEEN, 0]), Variation()), parameters=parameters, detachment=False)
+    physics.contact_solver.plant_plant_contacts = False
+    physics.add_robot(arm(BASE, HOME))
+    physics.wake(np.arange(4))
+    pilot = ReachPilot(physics, policy, wanted)
+    np.testing.assert_allclose(pilot.observation, observation[0], atol=1e-5)
+    forces = []
+    for _ in range(60):
+        action = towards(env, observation[:, 17:20])
+        policy.action = action[0]
+        pilot.act()
+        observation, _, terminated, truncated, info = env.step(action)
+        assert not (terminated | truncated).any()
+        np.testing.assert_allclose(pilot.targets[:7], env.worlds.bodies.targets.numpy()[0, :7], atol=2e-3)
+        for _ in range(4):
+            physics.step()
+        pilot.look()
+        seen = observation[0]
+        np.testing.assert_allclose(pilot.observation[:7], seen[:7], atol=2e-3)
+        np.testing.assert_allclose(pilot.observation[14:26], seen[14:26], atol=2e-3)
+        np.testing.assert_allclose(pilot.observation[26], seen[26], rtol=0.1, atol=0.3)
+        np.testing.assert_array_equal(pilot.observation[27:], seen[27:])
+        assert pilot.has_reached == info["success"][0]
+        forces.append(seen[26])
+    assert max(forces) > 1.0, "the arm has pressed on another shoot"
