@@ -1,11 +1,13 @@
 """A policy in the physics of a client, compared with the same policy in a batch."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 pytest.importorskip("gymnasium")
 pytest.importorskip("mujoco_warp")
-from tests.learn.arm_control import towards
+from tests.learn.arm_control import Reaching, towards
 from vinesim.learn.arm import arm
 from vinesim.learn.arm_env import BASE, HOME
 from vinesim.learn.evaluate import UNSEEN, evaluate, evaluate_with_full_physics, wanted_bunches
@@ -63,3 +65,27 @@ def test_a_client_and_a_batch_observe_and_act_alike() -> None:
         assert pilot.has_reached == info["success"][0]
         forces.append(seen[26])
     assert max(forces) > 1.0, "the arm has pressed on another shoot"
+
+
+def test_a_policy_reaches_the_same_bunches_in_a_batch_and_with_full_physics() -> None:
+    """Six worlds; a straight way to the bunch reaches most, and the physics must agree on all but one."""
+    batch = evaluate(Reaching(), 6, seed=2)
+    full = evaluate_with_full_physics(Reaching(), 6, seed=2)
+    assert batch.successes >= 4
+    assert abs(batch.successes - full.successes) <= 1
+    assert batch.actions == pytest.approx(full.actions, abs=6.0)
+    assert batch.faults == full.faults == 0
+    assert batch.line() == f"reached {batch.successes} of 6 ({100 * batch.successes / 6:.1f} %)"
+
+
+def test_an_evaluation_says_what_does_not_fit() -> None:
+    wrong = Policy("reach", *(np.ones(3, np.float32),) * 2, (np.ones((7, 3), np.float32),), (np.ones(7, np.float32),))
+    for run in (evaluate, evaluate_with_full_physics):
+        with pytest.raises(PolicyError, match="maps 3 numbers to 7, task reach has 31 and 7; train it again"):
+            run(wrong, 1)
+    with pytest.raises(PolicyError, match="for task 'swim', which is none of reach, expose"):
+        evaluate(dataclasses.replace(wrong, task="swim"), 1)
+    with pytest.raises(ValueError, match="there is only reach"):
+        evaluate_with_full_physics(dataclasses.replace(wrong, task="expose"), 1)
+    with pytest.raises(ValueError, match="only batches have it"):
+        evaluate_with_full_physics(wrong, 1, variation=Variation(delay=(0, 2)))
