@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.mark.parametrize(
     ("module", "library", "package"),
-    [("stable_baselines", "stable_baselines3", "stable-baselines3"), ("rsl", "rsl_rl", "rsl-rl-lib")],
+    [("stable_baselines", "stable_baselines3", "stable-baselines3"), ("rsl", "rsl_rl", "'vinesim\\[train\\]'")],
 )
 def test_without_the_library_the_message_says_what_to_install(module: str, library: str, package: str) -> None:
     if importlib.util.find_spec(library) is not None:

@@ -41,9 +41,10 @@ def run_training(
         raise UsageError("--full-physics without --evaluate FILE: a training runs in batches")
     _check(task, device)
     from vinesim.learn.evaluate import evaluate
-    from vinesim.learn.train import Training
+    from vinesim.learn.train import Training, require_libraries
     from vinesim.learn.variation import Variation
 
+    require_libraries()
     count = worlds or TRAINING_WORLDS
     ranges = variation or Variation()
     with writing(out):

@@ -16,7 +16,7 @@ try:
     from rsl_rl.env import VecEnv  # pyright: ignore[reportMissingImports]
     from tensordict import TensorDict  # pyright: ignore[reportMissingImports]
 except ImportError as error:
-    raise MissingExtra(f"this module needs rsl_rl: pip install rsl-rl-lib ({error})") from error
+    raise MissingExtra(f"this module needs rsl_rl: pip install 'vinesim[train]' ({error})") from error
 
 
 class Totals(NamedTuple):

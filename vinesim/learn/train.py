@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import importlib
 import importlib.metadata
 import io
 import json
@@ -26,7 +27,7 @@ HIDDEN = (256, 128, 64)
 """Widths of the hidden layers of the policy and of the value function."""
 ACTIONS = 32
 """Number of actions in each world between two updates of the policy."""
-VINES = 512
+VINES = 256
 """Largest number of different groups of plants in a training."""
 LIBRARIES = ("torch", "rsl-rl-lib", "warp-lang", "mujoco-warp")
 """Packages whose versions are kept with a training."""
@@ -66,6 +67,15 @@ class Progress:
     """Number of episodes that a fault ended in this iteration."""
 
 
+def require_libraries() -> None:
+    """Raise :class:`~vinesim.worlds.errors.MissingExtra`, with a remedy, unless PyTorch and rsl_rl can be imported."""
+    try:
+        importlib.import_module("vinesim.learn.rsl")
+        importlib.import_module("rsl_rl.runners")
+    except ImportError as error:
+        raise MissingExtra(f"training needs PyTorch and rsl_rl: pip install 'vinesim[train]' ({error})") from error
+
+
 class Training:
     """A training of a task. :meth:`iterations` trains; :meth:`policy` and :meth:`save` give what was learned so far.
 
@@ -90,15 +100,12 @@ class Training:
         seed: int = 1,
         variation: Variation | str | pathlib.Path = Variation(),
     ) -> None:
-        try:
-            import torch  # pyright: ignore[reportMissingImports]
+        require_libraries()
+        import torch  # pyright: ignore[reportMissingImports]
+        from rsl_rl.runners import OnPolicyRunner  # pyright: ignore[reportMissingImports]
 
-            from vinesim.learn.rsl import RslEnv
+        from vinesim.learn.rsl import RslEnv
 
-            with contextlib.redirect_stdout(io.StringIO()):
-                from rsl_rl.runners import OnPolicyRunner  # pyright: ignore[reportMissingImports]
-        except ImportError as error:
-            raise MissingExtra(f"training needs PyTorch and rsl_rl: pip install 'vinesim[train]' ({error})") from error
         self.task = task
         self.curve: list[Progress] = []
         self._origin = {"task": task, "seed": seed, "worlds": worlds, "vinesim": __version__}
