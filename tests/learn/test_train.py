@@ -4,6 +4,7 @@ import csv
 import importlib.util
 import json
 import pathlib
+import re
 import signal
 import subprocess
 import sys
@@ -72,6 +73,19 @@ def test_an_evaluation_prints_one_line(tmp_path: pathlib.Path, more: tuple[str, 
     done = programs.run(command("reach", "--evaluate", file, "--worlds", 2, *more), timeout=TIMEOUT)
     assert done.returncode == 0, done.stderr
     assert done.stdout == "reached 0 of 2 (0.0 %)\n"
+
+
+@pytest.mark.slow
+def test_the_example_of_the_page_runs_with_a_policy(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The block of docs/worlds.md. The commands of the page are those of the tests here, with fewer worlds."""
+    page = (pathlib.Path(__file__).parents[2] / "docs" / "worlds.md").read_text()
+    (block,) = (text for text in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "load_policy" in text)
+    (tmp_path / "run").mkdir()
+    resting().save(tmp_path / "run" / "policy.npz")
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    exec(block, names)
+    assert np.shape(names["observation"]) == (2, 31)
 
 
 @pytest.mark.gpu
