@@ -1,6 +1,9 @@
 """A policy in the physics of a client, compared with the same policy in a batch."""
 
 import dataclasses
+import json
+import pathlib
+import sys
 
 import numpy as np
 import pytest
@@ -8,17 +11,24 @@ import pytest
 pytest.importorskip("gymnasium")
 pytest.importorskip("mujoco_warp")
 from tests.learn.arm_control import Reaching, towards
+from tests.support import programs
+from tests.support.waiting import deadline
+from vinesim.core import frames
 from vinesim.learn.arm import arm
 from vinesim.learn.arm_env import BASE, HOME
-from vinesim.learn.evaluate import UNSEEN, evaluate, evaluate_with_full_physics, wanted_bunches
-from vinesim.learn.pilot import ReachPilot
+from vinesim.learn.evaluate import UNSEEN, evaluate, evaluate_with_full_physics, unseen_plants, wanted_bunches
+from vinesim.learn.pilot import ReachBunch, ReachPilot, arm_description
 from vinesim.learn.policy import Policy, PolicyError
 from vinesim.learn.reach import NUMBERS, ReachEnv, plants
 from vinesim.learn.variation import Variation
+from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.world import Physics
 
 pytestmark = pytest.mark.slow
+
+TIMEOUT = deadline(300.0)
+"""Limit for a command [s]; reached only by a failure."""
 
 
 class Given:
@@ -50,10 +60,11 @@ def test_a_client_and_a_batch_observe_and_act_alike() -> None:
     for _ in range(60):
         action = towards(env, observation[:, 17:20])
         policy.action = action[0]
-        pilot.act()
+        targets = pilot.act()
+        physics.rigid.command("arm", targets)
         observation, _, terminated, truncated, info = env.step(action)
         assert not (terminated | truncated).any()
-        np.testing.assert_allclose(pilot.targets[:7], env.worlds.bodies.targets.numpy()[0, :7], atol=2e-3)
+        np.testing.assert_allclose(targets[:7], env.worlds.bodies.targets.numpy()[0, :7], atol=2e-3)
         for _ in range(4):
             physics.step()
         pilot.look()
@@ -89,3 +100,47 @@ def test_an_evaluation_says_what_does_not_fit() -> None:
         evaluate_with_full_physics(dataclasses.replace(wrong, task="expose"), 1)
     with pytest.raises(ValueError, match="only batches have it"):
         evaluate_with_full_physics(wrong, 1, variation=Variation(delay=(0, 2)))
+
+
+def test_the_arm_of_a_client_follows_a_policy_like_that_of_the_physics() -> None:
+    """The client's robot has servos of its own, which follow the speed of their set-points."""
+    policy = Reaching()
+    wanted = int(wanted_bunches(1, 5)[0])
+    plain, client = (Physics(unseen_plants(0, 5)) for _ in range(2))
+    plain.add_robot(arm(BASE, HOME))
+    pilot = ReachPilot(plain, policy, wanted)
+    robot = Robot(client.rigid, arm_description(), "picker", 0, frames.pose(np.array(BASE)))
+    robot.fit_cutters(client)
+    task = ReachBunch(client, robot, policy, wanted)
+    for step in range(400):
+        task.control(client.time)
+        if task.is_done:
+            break
+        if step % 4 == 0:
+            pilot.look()
+            plain.rigid.command("arm", pilot.act())
+        robot.control(client.time)
+        client.step()
+        plain.step()
+        places = [physics.rigid.joint_measurements(name)[0] for physics, name in ((plain, "arm"), (client, "picker"))]
+        np.testing.assert_allclose(*places, atol=0.01)
+    assert task.succeeded
+    pilot.look()
+    assert pilot.has_reached
+
+
+def test_a_client_takes_a_policy_and_stops(tmp_path: pathlib.Path) -> None:
+    """A policy that rests does not reach its bunch in 4 s."""
+    file = tmp_path / "policy.npz"
+    layer = np.zeros((7, NUMBERS), np.float32), np.zeros(7, np.float32)
+    Policy("reach", np.zeros(NUMBERS, np.float32), np.ones(NUMBERS, np.float32), layer[:1], layer[1:]).save(file)
+    command = [sys.executable, "-m", "vinesim", "client", "--role", "robot", "--policy", str(file), "--no-ros"]
+    done = programs.run([*command, "--robot", "vinebot"], timeout=TIMEOUT)
+    assert done.returncode == 2
+    assert "--robot with --policy" in done.stderr
+    done = programs.run([*command, "--out", str(tmp_path / "run")], timeout=TIMEOUT)
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert report["time"] == pytest.approx(4.0, abs=0.1)
+    assert report["job"]["reason"] == "reach: not done after 4 s"
+    assert report["faults"] == {}

@@ -20,6 +20,7 @@ from vinesim.learn.policy import Policy, PolicyError
 from vinesim.learn.reach import NUMBERS, SHOOTS, plants
 from vinesim.learn.task_env import STEPS
 from vinesim.learn.variation import Variation, as_variation
+from vinesim.scene.model import Model
 from vinesim.world import Physics
 
 UNSEEN = 2**31
@@ -97,10 +98,10 @@ def evaluate_with_full_physics(
 ) -> Evaluation:
     """Returns how a policy for *reach* does with the physics of a client, one world after the other.
 
-    Vines and wanted bunches are those of the first ``worlds`` worlds of :func:`evaluate` with the same ``seed``. In
-    these worlds plants touch each other, break and sleep, and arms deform; a fault is a robot or a tree that was
-    stopped. Raises :class:`~vinesim.learn.policy.PolicyError` as :func:`evaluate` does, and :class:`ValueError` for
-    another task, and for a variation of friction or delay, which only batches have.
+    Vines and wanted bunches are those of the first ``worlds`` worlds of :func:`evaluate` with the same ``seed``. Here
+    plants touch each other, break and sleep. A fault is a robot or a tree that was stopped. Raises
+    :class:`~vinesim.learn.policy.PolicyError` as :func:`evaluate` does, and :class:`ValueError` for another task, and
+    for a variation of friction or delay, which only batches have.
     """
     ranges = as_variation(variation)
     if policy.task != "reach":
@@ -110,11 +111,11 @@ def evaluate_with_full_physics(
     policy.check_numbers(NUMBERS, len(AXES))
     successes = faults = actions = 0
     for number, wanted in enumerate(wanted_bunches(worlds, seed)):
-        physics = Physics(plants(np.random.default_rng([UNSEEN + seed, number]), ranges))
+        physics = Physics(unseen_plants(number, seed, ranges))
         physics.add_robot(arm(BASE, HOME))
         pilot = ReachPilot(physics, policy, int(wanted))
         for k in range(MAX_EPISODE_STEPS):
-            pilot.act()
+            physics.rigid.command("arm", pilot.act())
             for _ in range(STEPS):
                 physics.step()
             pilot.look()
@@ -126,6 +127,11 @@ def evaluate_with_full_physics(
                 actions += k + 1
                 break
     return Evaluation(policy.task, worlds, successes, faults, actions / max(successes, 1))
+
+
+def unseen_plants(number: int, seed: int, variation: Variation = Variation()) -> Model:
+    """Returns the shoots of world ``number`` of :func:`evaluate`, for the task reach."""
+    return plants(np.random.default_rng([UNSEEN + seed, number]), variation)
 
 
 def wanted_bunches(worlds: int, seed: int) -> np.ndarray:
