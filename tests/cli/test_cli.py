@@ -53,6 +53,7 @@ def test_help_shows_every_command_with_examples():
         "client",
         "record",
         "replay",
+        "train",
         "scene",
         "bench",
         "ros",

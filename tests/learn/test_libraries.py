@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.mark.parametrize(
     ("module", "library", "package"),
-    [("stable_baselines", "stable_baselines3", "stable-baselines3"), ("rsl", "rsl_rl", "rsl-rl-lib")],
+    [("stable_baselines", "stable_baselines3", "stable-baselines3"), ("rsl", "rsl_rl", "'vinesim\\[train\\]'")],
 )
 def test_without_the_library_the_message_says_what_to_install(module: str, library: str, package: str) -> None:
     if importlib.util.find_spec(library) is not None:
@@ -59,3 +59,38 @@ def test_rsl_rl_gets_time_outs_and_sets_the_ages_of_episodes() -> None:
     assert extras["time_outs"].tolist() == [True, False]
     assert observation["policy"].shape == (2, 31)
     assert env.episode_length_buf.tolist() == [0, 1]
+
+
+@pytest.mark.gpu
+def test_stable_baselines3_takes_one_world_and_learns_in_four() -> None:
+    pytest.importorskip("stable_baselines3")
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.env_checker import check_env
+
+    from vinesim.learn.one_world import ReachOne
+    from vinesim.learn.stable_baselines import StableBaselinesEnv
+
+    check_env(ReachOne())
+    model = PPO("MlpPolicy", StableBaselinesEnv(ReachEnv(4)), n_steps=32, batch_size=32, device="cpu", seed=1)
+    before = model.policy.action_net.weight.detach().clone()
+    model.learn(2 * 4 * 32)
+    change = (model.policy.action_net.weight.detach() - before).abs().max().item()
+    assert 0.0 < change < 1.0
+
+
+@pytest.mark.gpu
+def test_skrl_takes_the_environment_itself() -> None:
+    pytest.importorskip("skrl")
+    torch = pytest.importorskip("torch")
+    from skrl.envs.wrappers.torch import wrap_env
+
+    env = wrap_env(ReachEnv(2, max_episode_steps=2), wrapper="gymnasium")
+    observation, _ = env.reset()
+    assert observation.shape == (2, 31)
+    zero = torch.zeros(2, 7, device=env.device)
+    assert not env.step(zero)[3].any()
+    observation, reward, terminated, truncated, _ = env.step(zero)
+    assert truncated.all()
+    assert not terminated.any()
+    assert (reward < 0.0).all()
+    assert torch.isfinite(observation).all()

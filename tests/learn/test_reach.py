@@ -157,7 +157,7 @@ def test_gymnasiums_wrapper_counts_the_episodes_of_the_worlds():
 def test_the_examples_of_the_page_run():
     """The blocks of docs/worlds.md."""
     page = (pathlib.Path(__file__).parents[2] / "docs" / "worlds.md").read_text()
-    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    blocks = re.findall(r"<!-- place: tests/learn/test_reach.py -->\n```python\n(.*?)```", page, re.DOTALL)
     assert len(blocks) == 2
     for block in blocks:
         exec(block, {})

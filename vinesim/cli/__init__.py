@@ -23,6 +23,7 @@ import typer
 from vinesim.cli.commands.client import client
 from vinesim.cli.commands.demo import demo
 from vinesim.cli.commands.images import dataset, export, render, scene_import_plant, scene_show
+from vinesim.cli.commands.learning import train
 from vinesim.cli.commands.perception import fuse, view
 from vinesim.cli.commands.recording import record, replay
 from vinesim.cli.commands.server import server
@@ -71,6 +72,7 @@ for command in (
     track,
     tune,
     experiment,
+    train,
     bench,
     doctor,
 ):

@@ -127,6 +127,14 @@ class ClientOptions:
     job: Annotated[
         str | None, OF_ROBOT, typer.Option(help="Robots: do a task and stop: pick, exchange, meet or prune.")
     ] = None
+    policy: Annotated[
+        pathlib.Path | None,
+        OF_ROBOT,
+        typer.Option(
+            help="Robots: a policy.npz of vinesim train reach. It brings the arm of that task to a bunch of the task's "
+            "shoots, drawn by --seed, and stops."
+        ),
+    ] = None
     bunches: Annotated[
         int,
         OF_ROBOT,

@@ -56,8 +56,9 @@ T = TypeVar("T")
 class ClientSession:
     """One client process: its scene, its buses and its loop. A context manager that closes all of them in order."""
 
-    def __init__(self, options: ClientOptions) -> None:
-        """Check the options and generate the vineyard. Raises errors of the scene and :class:`UsageError`."""
+    def __init__(self, options: ClientOptions, model: Model | None = None) -> None:
+        """Check the options and generate the vineyard, unless a ``model`` replaces it. Raises errors of the scene and
+        :class:`UsageError`."""
         check_options(options)
         # The loop releases the interpreter lock at every kernel launch and needs it back within a fraction of a step.
         sys.setswitchinterval(SWITCH_INTERVAL)
@@ -73,7 +74,7 @@ class ClientSession:
         # the loop starts before the kernels of cameras and lidars are compiled; sensor processes wait for those kernels
         sensors = SENSOR_PACKAGES if options.role == "robot" else ()
         compile_kernels(PHYSICS_PACKAGES, options.device, then=sensors)
-        self.model = generate(self.scene)
+        self.model = generate(self.scene) if model is None else model
         self._hub = MemoryHub()
         self._stack = contextlib.ExitStack()
         self._stop = threading.Event()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from vinesim.client.tasks.harvesting import HarvestOptions
 from vinesim.client.tasks.motions import DriveTo, LookAt
 from vinesim.client.tasks.registry import plan_task, validate_sight, validate_task_name
 from vinesim.client.tasks.start_poses import start_pose, validate_bunch
+from vinesim.core import frames
 from vinesim.core.errors import UsageError, writing
 from vinesim.net.transport.bus import Bus
 from vinesim.robot.description.controllers import only_hardware
@@ -28,6 +29,7 @@ from vinesim.robot.tasks.push import PushBunch
 from vinesim.robot.tasks.sight import RobotSight
 from vinesim.robot.tasks.task import Task
 from vinesim.ros.names import ros_name, ros_namespace
+from vinesim.scene.model import Model
 from vinesim.scene.values import SensorMode, SensorPacing
 from vinesim.world import Physics
 
@@ -37,15 +39,21 @@ def run(options: ClientOptions) -> int:
     validate_task_name(options.job)
     validate_sight(options.job, options.see)
     harvest = HarvestOptions.named(options.bunches, options.order)
-    descriptions = [
-        load_description(robot, srdf=options.srdf, xacro_args=options.xacro_args or (), base=options.base)
-        for robot in options.robot or ["vinebot"]
-    ]
+    learned = None if options.policy is None else _learned_reach(options)
+    if learned is None:
+        descriptions = [
+            load_description(robot, srdf=options.srdf, xacro_args=options.xacro_args or (), base=options.base)
+            for robot in options.robot or ["vinebot"]
+        ]
+    else:
+        descriptions = [learned.description]
     _check_driven(options, descriptions)
     if options.controllers == "none":
         descriptions = [only_hardware(description) for description in descriptions]
-    with ClientSession(options) as session:
+    with ClientSession(options, None if learned is None else learned.model) as session:
         begin = start = None
+        if learned is not None:
+            begin, start = learned.begin, learned.start
         if options.job is not None:
             near = start_pose(session.scene, session.spawn or 0)
             begin, start = plan_task(options.job, session.model, near, harvest, _eyes(session) if options.see else None)
@@ -99,6 +107,48 @@ def run(options: ClientOptions) -> int:
                 with writing(options.out / "trace.npz"):
                     client.trace.rows().save(options.out / "trace.npz")
     return 0
+
+
+class _LearnedTask(NamedTuple):
+    """What a policy needs instead of a vineyard and a robot of the user."""
+
+    model: Model
+    description: RobotDescription
+    start: np.ndarray
+    """[7] Pose of the robot."""
+    begin: Callable[[Physics, Robot], Task]
+
+
+def _learned_reach(options: ClientOptions) -> _LearnedTask:
+    """Load the policy of ``--policy`` and draw its task. Raises :class:`UsageError` for options that do not fit."""
+    unfit = {
+        "--robot": options.robot,
+        "--connect": options.connect,
+        "--job": options.job,
+        "--push": options.push,
+        "--approach": options.approach or None,
+        "--pose": options.pose,
+        "--controllers none": options.controllers == "none" or None,
+    }
+    given = next((flag for flag, value in unfit.items() if value is not None), None)
+    if given is not None:
+        raise UsageError(f"{given} with --policy {options.policy}: the task has its own robot and plants; leave it out")
+    from vinesim.learn.arm_env import BASE
+    from vinesim.learn.evaluate import unseen_plants, wanted_bunches
+    from vinesim.learn.pilot import ReachBunch, arm_description
+    from vinesim.learn.policy import load_policy
+
+    policy = load_policy(str(options.policy))
+    if policy.task != "reach":
+        raise UsageError(f"--policy {options.policy} is for {policy.task}; give one of vinesim train reach")
+    seed = options.seed or 0
+    (wanted,) = wanted_bunches(1, seed)
+    return _LearnedTask(
+        unseen_plants(0, seed),
+        arm_description(),
+        frames.pose(np.array(BASE)),
+        functools.partial(ReachBunch, policy=policy, wanted=int(wanted)),
+    )
 
 
 def _eyes(session: ClientSession) -> Callable[[Physics, Robot], RobotSight]:
@@ -215,7 +265,13 @@ def _add_behaviour(session: ClientSession, client: Client, task: Task | None, go
     """Let the robots drive to ``goals`` [7] (none: they stay), push the bunch of ``--push``, do the ``task``, and look
     at their work."""
     options = session.options
-    given = {"--job": options.job, "--push": options.push, "--watch": options.watch, "--approach": goals or None}
+    given = {
+        "--policy": options.policy,
+        "--job": options.job,
+        "--push": options.push,
+        "--watch": options.watch,
+        "--approach": goals or None,
+    }
     client.script = next((name for name, value in given.items() if value is not None), "")
     watched = options.watch if options.watch is not None else options.push
     if watched is not None:

@@ -11,9 +11,12 @@ try:
 except ImportError as error:
     raise MissingExtra(f"vinesim.learn needs gymnasium: pip install 'vinesim[learn]' ({error})") from error
 
-for _task in ("Reach", "Expose"):
+TASKS = {"reach": "reached", "expose": "exposed"}
+"""Tasks by name, each with the word for its success. Task ``reach`` is ``vinesim.learn.reach.ReachEnv``."""
+
+for _task in TASKS:
     gymnasium.register(
-        f"vinesim/{_task}-v0",
-        entry_point=f"vinesim.learn.one_world:{_task}One",
-        vector_entry_point=f"vinesim.learn.{_task.lower()}:{_task}Env",
+        f"vinesim/{_task.capitalize()}-v0",
+        entry_point=f"vinesim.learn.one_world:{_task.capitalize()}One",
+        vector_entry_point=f"vinesim.learn.{_task}:{_task.capitalize()}Env",
     )

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 import pathlib
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
-import warp as wp
 
 from vinesim.kernels.graph import KernelLaunch
-from vinesim.kernels.learn.reach import ArmState, move_targets
-from vinesim.learn.arm import AXES, JOINT_LIMIT, TOOL, TOOL_LINK, arm
-from vinesim.learn.task_env import STEPS, TaskEnv, check_options
+from vinesim.learn.arm import AXES, arm
+from vinesim.learn.arm_arrays import ArmArrays, arrays_of_worlds
+from vinesim.learn.task_env import TaskEnv, check_options
 from vinesim.learn.variation import Variation, as_variation
 from vinesim.scene.model import Model
 from vinesim.worlds.plants import plants_of_worlds
@@ -25,12 +24,8 @@ BASE = (-0.1, 0.0, 0.6)
 HOME = np.array([0.0, -2.3, 0.0, 1.9, 0.0, 1.6, 0.0, 0.0, 0.0])
 """First positions of the joints [rad] and fingers [m]."""
 MAX_EPISODE_STEPS = 100
-SPEED = 1.0
-"""[rad/s] Speed of a joint's target at action 1."""
-LEAD = 0.3
-"""[rad] Largest distance of a joint's target from the joint."""
 VARIANTS = 64
-"""Number of different groups of shoots; further worlds repeat them."""
+"""Default for the number of different groups of plants; further worlds repeat them."""
 Plants = Callable[[np.random.Generator, Variation], Model]
 
 
@@ -46,6 +41,7 @@ class ArmEnv(TaskEnv):
         arrays: ``"numpy"``, ``"torch"`` or ``"warp"``; see :class:`~vinesim.learn.task_env.TaskEnv`, which also
             describes ``info`` and errors.
         vines_seed: seed of the differences between worlds; the differences stay the same after a reset.
+        vines: number of different groups of plants; further worlds repeat them.
         variation: ranges of these numbers, or a TOML file with them.
         max_episode_steps: number of actions after which an episode is truncated.
     """
@@ -59,6 +55,7 @@ class ArmEnv(TaskEnv):
         device: str = "cpu",
         arrays: str = "numpy",
         vines_seed: int = 0,
+        vines: int = VARIANTS,
         variation: Variation | str | pathlib.Path = Variation(),
         max_episode_steps: int = MAX_EPISODE_STEPS,
         render_mode: str | None = None,
@@ -66,7 +63,7 @@ class ArmEnv(TaskEnv):
         check_options(num_envs, arrays, render_mode)
         ranges = as_variation(variation)
         variants = [
-            plants(np.random.default_rng([vines_seed, number]), ranges) for number in range(min(num_envs, VARIANTS))
+            plants(np.random.default_rng([vines_seed, number]), ranges) for number in range(min(num_envs, vines))
         ]
         super().__init__(
             Worlds(plants_of_worlds(variants, num_envs), num_envs, robots=[arm(BASE, HOME)], device=device),
@@ -75,33 +72,15 @@ class ArmEnv(TaskEnv):
             device=device,
             arrays=arrays,
             variation=ranges,
-            rng=np.random.default_rng([vines_seed, VARIANTS]),
+            rng=np.random.default_rng([vines_seed, vines]),
             max_episode_steps=max_episode_steps,
             render_mode=render_mode,
         )
 
+    @functools.cached_property
+    def arm_arrays(self) -> ArmArrays:
+        """What kernels read and write."""
+        return arrays_of_worlds(self.worlds)
+
     def _moves(self) -> list[KernelLaunch]:
-        bodies = self.worlds.bodies
-        joints = len(AXES)
-        limit = np.full(joints, JOINT_LIMIT)
-        q = self.on_device(bodies.rigid.robot("arm").q[:joints], wp.int32)
-        limits = [self.on_device(-limit, float), self.on_device(limit, float)]
-        given = [SPEED * STEPS * self.worlds.dt, *limits, LEAD, q, self._action, bodies.data.qpos]
-        return [KernelLaunch(move_targets, given, [bodies.targets], threads=self.num_envs, width=joints)]
-
-    def _arm_state(self) -> ArmState:
-        data = self.worlds.bodies.data
-        robot = self.worlds.bodies.rigid.robot("arm")
-        state = ArmState()
-        state.tool_body, state.tool = robot.bodies[TOOL_LINK], wp.vec3(*TOOL)
-        state.q, state.v = (self.on_device(index[: len(AXES)], wp.int32) for index in (robot.q, robot.v))
-        state.xpos, state.xmat, state.qpos, state.qvel = data.xpos, data.xmat, data.qpos, data.qvel
-        return state
-
-    def _bunches(self) -> list[Any]:
-        """Returns the arguments of kernels for the bunches [tree]: bodies, centres of mass, and poses of bodies."""
-        worlds = self.worlds
-        body = worlds.model.bunch_body
-        place = self.on_device(worlds.plants.buffers.slots[body], wp.int32)
-        centre = self.on_device(worlds.model.body_com[body], wp.vec3)
-        return [place, centre, worlds.plants.launches.resident_arrays["body_q"]]
+        return [self.arm_arrays.move(self._action, self.worlds.dt)]

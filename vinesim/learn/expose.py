@@ -59,16 +59,18 @@ class ExposeEnv(ArmEnv):
         numbers = kernels.ExposeNumbers()
         numbers.eye, numbers.share, numbers.speed = wp.vec3(*EYE), SHARE, SPEED
         numbers.success_reward, numbers.force_cost, numbers.action_cost = 10.0, 0.02, 0.01
+        arrays = self.arm_arrays
         given = [
             numbers,
-            self._arm_state(),
-            *self._bunches(),
+            arrays.arm,
+            *arrays.bunches,
             worlds.plants.launches.resident_arrays["body_qd"],
             self.on_device(np.stack([model.bunch_length, model.bunch_radius], -1), wp.vec2),
             self.num_envs,
             worlds.contacts.capsules,
             self._given_action,
-            *worlds.contacts.lists(),
+            arrays.contacts,
+            arrays.world_contacts,
         ]
         return [KernelLaunch(kernels.observe, given, [observation, reward, success], threads=self.num_envs)]
 

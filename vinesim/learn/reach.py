@@ -4,17 +4,23 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from vinesim.kernels.graph import KernelLaunch
 from vinesim.kernels.learn import reach as kernels
 from vinesim.kernels.learn.episodes import draw_targets
 from vinesim.learn.arm import AXES
+from vinesim.learn.arm_arrays import ArmArrays
 from vinesim.learn.arm_env import DISTANCE, ArmEnv
 from vinesim.learn.shoots import shoots
+from vinesim.learn.variation import Variation
+from vinesim.scene.model import Model
 
 SHOOTS = 4
 """Number of shoots of a world; each has one bunch."""
+NUMBERS = 2 * len(AXES) + 3 * SHOOTS + 1 + SHOOTS
+"""Number of an observation's components."""
 REACH = 0.05
 """[m] Distance from the middle of a bunch at which it is reached: its surface is then between the fingers."""
 
@@ -35,24 +41,33 @@ class ReachEnv(ArmEnv):
 
     def __init__(self, num_envs: int = 1, **options: Any) -> None:
         self._target = wp.zeros(max(num_envs, 1), dtype=wp.int32, device=options.get("device", "cpu"))
-        numbers = 2 * len(AXES) + 3 * SHOOTS + 1 + SHOOTS
-        super().__init__(lambda rng, variation: shoots(SHOOTS, rng, DISTANCE, variation), numbers, num_envs, **options)
+        super().__init__(plants, NUMBERS, num_envs, **options)
 
     def _beginnings(self) -> list[KernelLaunch]:
         given = [SHOOTS, self._seed, self._begins]
         return [KernelLaunch(draw_targets, given, [self._episode, self._target], threads=self.num_envs)]
 
     def _observations(self, observation: wp.array, reward: wp.array, success: wp.array) -> list[KernelLaunch]:
-        numbers = kernels.ReachNumbers()
-        numbers.reach, numbers.success_reward = REACH, 10.0
-        numbers.distance_cost, numbers.force_cost, numbers.action_cost = 1.0, 0.02, 0.01
-        given = [
-            numbers,
-            self._arm_state(),
-            *self._bunches(),
-            self.num_envs,
-            self._target,
-            self._given_action,
-            *self.worlds.contacts.lists(),
-        ]
-        return [KernelLaunch(kernels.observe, given, [observation, reward, success], threads=self.num_envs)]
+        return [observe(self.arm_arrays, self._target, self._given_action, [observation, reward, success])]
+
+
+def plants(rng: np.random.Generator, variation: Variation) -> Model:
+    """Returns the shoots of a world."""
+    return shoots(SHOOTS, rng, DISTANCE, variation)
+
+
+def observe(arrays: ArmArrays, target: wp.array, action: wp.array, written: list[wp.array]) -> KernelLaunch:
+    """Returns the launch that judges the state of all worlds.
+
+    Args:
+        arrays: the state.
+        target: int32 [world], which tree's bunch is wanted.
+        action: [world, joint] the last action.
+        written: observation [world, :data:`NUMBERS`], reward and success [world].
+    """
+    numbers = kernels.ReachNumbers()
+    numbers.reach, numbers.success_reward = REACH, 10.0
+    numbers.distance_cost, numbers.force_cost, numbers.action_cost = 1.0, 0.02, 0.01
+    given = [numbers, arrays.arm, *arrays.bunches, arrays.worlds, target, action]
+    given += [arrays.contacts, arrays.world_contacts]
+    return KernelLaunch(kernels.observe, given, written, threads=arrays.worlds)

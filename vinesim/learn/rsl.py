@@ -2,24 +2,40 @@
 
 from __future__ import annotations
 
-from typing import Any
+import os
+from typing import Any, NamedTuple
 
 import warp as wp
 
 from vinesim.learn.task_env import TaskEnv
 from vinesim.worlds.errors import MissingExtra
 
+os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")  # rsl_rl imports GitPython, which refuses a machine without git
 try:
+    import torch  # pyright: ignore[reportMissingImports]
     from rsl_rl.env import VecEnv  # pyright: ignore[reportMissingImports]
     from tensordict import TensorDict  # pyright: ignore[reportMissingImports]
 except ImportError as error:
-    raise MissingExtra(f"this module needs rsl_rl: pip install rsl-rl-lib ({error})") from error
+    raise MissingExtra(f"this module needs rsl_rl: pip install 'vinesim[train]' ({error})") from error
+
+
+class Totals(NamedTuple):
+    """Sums over all worlds and some actions."""
+
+    reward: float
+    ended: int
+    """Number of episodes that ended."""
+    success: int
+    """Number of episodes that ended with success."""
+    fault: int
+    """Number of episodes that ended with a fault."""
 
 
 class RslEnv(VecEnv):
     """A task as a ``VecEnv`` of rsl_rl: ``OnPolicyRunner(RslEnv(ReachEnv(4096, device="cuda", arrays="torch")), ...)``.
 
-    Observations are in the group ``policy``.
+    Observations are in the group ``policy``. The logged ``/success`` is the share of worlds whose last episode ended
+    with success.
 
     ``env``: the task, with arrays of PyTorch. Raises :class:`ValueError` for others.
     """
@@ -35,6 +51,8 @@ class RslEnv(VecEnv):
         self.max_episode_length = env.max_episode_steps
         self._elapsed = wp.to_torch(env.elapsed)
         self._observations = self._grouped(env.reset()[0])
+        self._succeeded = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
+        self._totals = torch.zeros(len(Totals._fields), dtype=torch.float64, device=env.device)
 
     @property
     def episode_length_buf(self) -> Any:
@@ -53,8 +71,20 @@ class RslEnv(VecEnv):
         """Take one action in each world. Returns observations, rewards, which worlds ended, and other numbers."""
         observation, reward, terminated, truncated, info = self.env.step(actions)
         self._observations = self._grouped(observation)
-        log = {"/success": info["success"].float().mean(), "/fault": (info["fault"] != 0).float().mean()}
-        return self._observations, reward, terminated | truncated, {"time_outs": truncated, "log": log}
+        ended = terminated | truncated
+        success = info["success"]
+        fault = info["fault"] != 0
+        self._succeeded = torch.where(ended, success, self._succeeded)
+        sums = [values.sum(dtype=torch.float64) for values in (reward, ended, success, fault)]
+        self._totals += torch.stack(sums)
+        log = {"/success": self._succeeded.float().mean(), "/fault": fault.float().mean()}
+        return self._observations, reward, ended, {"time_outs": truncated, "log": log}
+
+    def take_totals(self) -> Totals:
+        """Returns the sums over all actions since the last call."""
+        reward, *counts = self._totals.tolist()
+        self._totals.zero_()
+        return Totals(reward, *map(round, counts))
 
     def _grouped(self, observation: Any) -> Any:
         return TensorDict({"policy": observation}, batch_size=[self.num_envs])

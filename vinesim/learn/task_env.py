@@ -87,6 +87,7 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         self.num_envs = worlds.count
         self.render_mode = None
         self.num_actions = actions
+        self.num_observations = numbers
         self.max_episode_steps = max_episode_steps
         self.arrays = arrays
         self.device = device
@@ -210,7 +211,7 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         if self.arrays == "numpy":
             self._given_action.assign(np.asarray(actions, np.float32).reshape(self._action.shape))
             return
-        given = actions if self.arrays == "warp" else wp.from_torch(actions.detach().contiguous(), dtype=float)
+        given = actions if self.arrays == "warp" else wp.from_torch(actions.detach().contiguous(), dtype=wp.float32)
         if given.shape != self._action.shape:
             raise ValueError(f"actions of shape {given.shape}: give {self._action.shape}")
         wp.copy(self._given_action, given)

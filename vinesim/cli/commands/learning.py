@@ -1,0 +1,80 @@
+"""``vinesim train``: its options."""
+
+from __future__ import annotations
+
+import pathlib
+from typing import Annotated
+
+import typer
+
+from vinesim.cli.commands.options import Device
+
+
+def train(
+    task: Annotated[str, typer.Argument(help="reach or expose.")],
+    out: Annotated[
+        pathlib.Path | None, typer.Option(help="Folder for policy.npz, curve.csv and summary.json of a training.")
+    ] = None,
+    evaluate: Annotated[
+        pathlib.Path | None, typer.Option(help="Do not train: evaluate this policy.npz on vines never seen.")
+    ] = None,
+    worlds: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Number of worlds; by default 4096 for a training, 500 for --evaluate, 100 with --full-physics.",
+        ),
+    ] = None,
+    device: Device = "cpu",
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of vines, tasks and weights.")] = 1,
+    iterations: Annotated[
+        int, typer.Option(min=1, help="Number of updates of the policy; each follows 32 actions in each world.")
+    ] = 300,
+    minutes: Annotated[
+        float | None, typer.Option(min=0.0, help="End the training after this time, even before --iterations [min].")
+    ] = None,
+    variation: Annotated[
+        pathlib.Path | None, typer.Option(help="TOML file: ranges in which worlds differ (docs/worlds.md).")
+    ] = None,
+    full_physics: Annotated[
+        bool,
+        typer.Option(
+            "--full-physics",
+            help="With --evaluate: one world after the other with the physics of a client, without batch.",
+        ),
+    ] = False,
+) -> None:
+    """Train a policy for a task by PPO on many worlds at once, then evaluate it on vines never seen.
+
+    A training needs PyTorch and rsl_rl (extra: train), and in practice an NVIDIA GPU. Its files are brought up to date
+    every 10 s; Ctrl-C ends it and keeps what was learned. An evaluation takes one episode in each of 500 worlds with
+    different vines, and needs no PyTorch (extra: learn).
+
+    \b
+    Examples:
+      vinesim train reach --out run --device cuda
+      vinesim train reach --out run --device cuda --worlds 8192 --minutes 5 --variation ranges.toml
+      vinesim train reach --evaluate run/policy.npz --worlds 500
+      vinesim train reach --evaluate run/policy.npz --full-physics
+    """
+    from vinesim.cli.train import run_evaluation, run_training
+
+    if evaluate is not None:
+        raise typer.Exit(
+            run_evaluation(
+                task, evaluate, out, worlds, device=device, seed=seed, variation=variation, full=full_physics
+            )
+        )
+    raise typer.Exit(
+        run_training(
+            task,
+            out,
+            worlds,
+            device=device,
+            seed=seed,
+            iterations=iterations,
+            minutes=minutes,
+            variation=variation,
+            full=full_physics,
+        )
+    )

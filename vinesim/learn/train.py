@@ -1,0 +1,197 @@
+"""Training of a policy by PPO of rsl_rl, on a batch of worlds."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib
+import importlib.metadata
+import io
+import json
+import pathlib
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from vinesim.core.errors import writing
+from vinesim.core.version import __version__
+from vinesim.learn.evaluate import environment
+from vinesim.learn.policy import Policy
+from vinesim.learn.variation import Variation
+from vinesim.sensors.export.files import write_files
+from vinesim.worlds.errors import MissingExtra
+
+HIDDEN = (256, 128, 64)
+"""Widths of the hidden layers of the policy and of the value function."""
+ACTIONS = 32
+"""Number of actions in each world between two updates of the policy."""
+VINES = 256
+"""Largest number of different groups of plants in a training."""
+LIBRARIES = ("torch", "rsl-rl-lib", "warp-lang", "mujoco-warp")
+"""Packages whose versions are kept with a training."""
+PPO: dict[str, Any] = {
+    "class_name": "PPO",
+    "learning_rate": 1e-3,
+    "schedule": "adaptive",
+    "desired_kl": 0.01,
+    "gamma": 0.98,
+    "lam": 0.95,
+    "entropy_coef": 0.002,
+    "num_learning_epochs": 5,
+    "num_mini_batches": 4,
+    "clip_param": 0.2,
+    # returns are far larger than 0.2, by which a clipped loss lets the value of a state change in one iteration
+    "use_clipped_value_loss": False,
+    "value_loss_coef": 1.0,
+    "max_grad_norm": 1.0,
+}
+"""Configuration of rsl_rl's PPO. TUNED on the task reach."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """State of a training after an iteration. Its fields are the columns of ``curve.csv``."""
+
+    iteration: int
+    seconds: float
+    """[s] Since the first iteration began."""
+    actions: int
+    """Number of actions so far, in all worlds."""
+    mean_reward: float
+    """Mean reward of an action of this iteration."""
+    success: float
+    """Share of the episodes that ended in this iteration with success; NaN if none ended."""
+    faults: int
+    """Number of episodes that a fault ended in this iteration."""
+
+
+def require_libraries() -> None:
+    """Raise :class:`~vinesim.worlds.errors.MissingExtra`, with a remedy, unless PyTorch and rsl_rl can be imported."""
+    try:
+        importlib.import_module("vinesim.learn.rsl")
+        importlib.import_module("rsl_rl.runners")
+    except ImportError as error:
+        raise MissingExtra(f"training needs PyTorch and rsl_rl: pip install 'vinesim[train]' ({error})") from error
+
+
+class Training:
+    """A training of a task. :meth:`iterations` trains; :meth:`policy` and :meth:`save` give what was learned so far.
+
+    Args:
+        task: name of the task, one of :data:`vinesim.learn.TASKS`.
+        worlds: number of worlds.
+        device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
+        seed: seed of vines, wanted bunches, weights and explored actions, below
+            :data:`~vinesim.learn.evaluate.UNSEEN`.
+        variation: ranges of the numbers in which worlds differ, or a TOML file with them.
+
+    Raises :class:`~vinesim.worlds.errors.MissingExtra` without PyTorch or rsl_rl, and errors of
+    :class:`~vinesim.learn.arm_env.ArmEnv`.
+    """
+
+    def __init__(
+        self,
+        task: str,
+        worlds: int,
+        *,
+        device: str = "cpu",
+        seed: int = 1,
+        variation: Variation | str | pathlib.Path = Variation(),
+    ) -> None:
+        require_libraries()
+        import torch  # pyright: ignore[reportMissingImports]
+        from rsl_rl.runners import OnPolicyRunner  # pyright: ignore[reportMissingImports]
+
+        from vinesim.learn.rsl import RslEnv
+
+        self.task = task
+        self.curve: list[Progress] = []
+        self._origin = {"task": task, "seed": seed, "worlds": worlds, "vinesim": __version__}
+        torch.manual_seed(seed)
+        env = environment(task)(
+            worlds, device=device, arrays="torch", vines_seed=seed, vines=VINES, variation=variation
+        )  # fmt: skip
+        env.reset(seed=seed)
+        env.step(torch.zeros(env.num_envs, env.num_actions, device=device))  # the first step compiles the kernels
+        self._env = RslEnv(env)
+        self._device = str(env.worlds.bodies.device.name)
+        network = {
+            "class_name": "MLPModel",
+            "hidden_dims": list(HIDDEN),
+            "activation": "elu",
+            "obs_normalization": True,
+        }
+        actions = {"class_name": "GaussianDistribution", "init_std": 1.0, "std_type": "log"}
+        config = {
+            "num_steps_per_env": ACTIONS,
+            "save_interval": 1,  # nothing is saved without a folder for logs
+            "check_for_nan": False,  # a check waits for the GPU; the environment gives finite numbers only
+            "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+            "actor": network | {"distribution_cfg": actions},
+            "critic": network,
+            "algorithm": PPO,
+        }
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints its networks
+            self._runner = OnPolicyRunner(self._env, config, log_dir=None, device=device)
+
+    def iterations(self, count: int) -> Iterator[Progress]:
+        """Train for ``count`` iterations. Yields the state after each one."""
+        begin = time.monotonic()
+        for i in range(count):
+            self._runner.learn(1, init_at_random_ep_len=i == 0)
+            total = self._env.take_totals()
+            actions = self._env.num_envs * ACTIONS
+            done = Progress(
+                iteration=i + 1,
+                seconds=time.monotonic() - begin,
+                actions=actions * (i + 1),
+                mean_reward=total.reward / actions,
+                success=total.success / total.ended if total.ended else float("nan"),
+                faults=total.fault,
+            )
+            self.curve.append(done)
+            yield done
+
+    def policy(self) -> Policy:
+        """Returns what was learned so far. It takes the mean of the actions that the training would explore."""
+        actor = self._runner.alg.get_policy()
+        state = {
+            name: value.detach().cpu().numpy().astype(np.float32) for name, value in actor.mlp.state_dict().items()
+        }
+        layers = sorted({int(name.split(".")[0]) for name in state})
+        normalizer = actor.obs_normalizer
+        return Policy(
+            self.task,
+            normalizer.mean.cpu().numpy(),
+            normalizer.std.cpu().numpy() + np.float32(normalizer.eps),
+            tuple(state[f"{layer}.weight"] for layer in layers),
+            tuple(state[f"{layer}.bias"] for layer in layers),
+        )
+
+    def save(self, folder: pathlib.Path, results: dict[str, Any] | None = None) -> None:
+        """Write ``policy.npz``, ``curve.csv`` and ``summary.json`` into ``folder``, which exists.
+
+        ``results``: further fields of the summary. Raises :class:`~vinesim.core.errors.WriteError`.
+        """
+        self.policy().save(folder / "policy.npz")
+        lines = [",".join(field.name for field in dataclasses.fields(Progress))]
+        for done in self.curve:
+            row = (done.iteration, f"{done.seconds:.2f}", done.actions, f"{done.mean_reward:.5f}")
+            share = "" if np.isnan(done.success) else f"{done.success:.4f}"
+            lines.append(",".join(map(str, (*row, share, done.faults))))
+        last = self.curve[-1] if self.curve else None
+        summary = self._origin | {
+            "device": self._device,
+            "libraries": {name: importlib.metadata.version(name) for name in LIBRARIES},
+            "iterations": 0 if last is None else last.iteration,
+            "seconds": 0.0 if last is None else round(last.seconds, 1),
+            "actions": 0 if last is None else last.actions,
+        }
+        files = {
+            folder / "curve.csv": "\n".join(lines) + "\n",
+            folder / "summary.json": json.dumps(summary | (results or {}), indent=2) + "\n",
+        }
+        with writing(folder):
+            write_files({path: [text.encode()] for path, text in files.items()})
