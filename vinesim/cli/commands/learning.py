@@ -46,9 +46,9 @@ def train(
 ) -> None:
     """Train a policy for a task by PPO on many worlds at once, then evaluate it on vines never seen.
 
-    A training needs PyTorch and rsl_rl (extra: train), and in practice an NVIDIA GPU. Its files are brought up to date
-    every 10 s; Ctrl-C ends it and keeps what was learned. An evaluation takes one episode in each of 500 worlds with
-    different vines, and needs no PyTorch (extra: learn).
+    A training needs PyTorch and rsl_rl (extra: train); an NVIDIA GPU lets it have thousands of worlds. Its files are
+    brought up to date every 10 s; Ctrl-C ends it and keeps what was learned. An evaluation takes one episode in each of
+    500 worlds with different vines, and needs no PyTorch (extra: learn).
 
     \b
     Examples:
