@@ -18,6 +18,7 @@ subtracts that amount from the model's damping, down to zero. The total damping 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import logging
 import math
 import weakref
@@ -2391,16 +2392,18 @@ class StepRunner:
         if self.uploaded != counts or len(self.fast) or len(roots):
             self._launches.upload_trees()
             self.uploaded = counts
-        if not self._buffers.device.is_cpu:
-            what = (self._whole_groups, self._room, len(self._levels), self._kind, between, beside)
+        if self._buffers.device.is_cpu:
+            self._steps(steps, between, beside)
+        elif beside is _NOTHING_BESIDE:
+            what = (self._whole_groups, self._room, len(self._levels), self._kind, between)
             if self._graph is None or self._graph_of != what:
                 with wp.ScopedCapture(self._buffers.device) as capture:
-                    self._step_beside(between, beside)
+                    self._steps(1, between, beside)
                 self._graph, self._graph_of = capture.graph, what
             for _ in range(steps):
                 wp.capture_launch(self._graph)  # pyright: ignore[reportArgumentType]  (captured above)
         else:
-            self._steps(steps, between, beside)
+            self._steps_on_two_streams(steps, between, beside)
         self._launches.download_trees()
         self._buffers.synchronize()
 
@@ -2413,23 +2416,28 @@ class StepRunner:
             self._integrate(step)
             beside.integrate()
 
-    def _step_beside(self, between: Callable[[], None], beside: Beside) -> None:
-        """Launch a step on a GPU, whose second stream has the trees.
+    def _steps_on_two_streams(self, steps: int, between: Callable[[], None], beside: Beside) -> None:
+        """Take steps on a GPU with the trees on a second stream, beside what ``beside`` launches.
 
-        The other launches stay on the stream that is being captured, where alone Warp allows graphs with conditions.
+        The launches are one graph each, not one for the whole step: Warp refuses a conditional node, which mujoco_warp
+        has, in a graph that is captured from two streams.
         """
         step = self._launches.resident
         stream = self._buffers.device.stream
-        trees = wp.Stream(self._buffers.device)
-        with wp.ScopedStream(trees):  # waits for the stream
-            step.predict(self._whole_groups)
-        beside.predict()
-        stream.wait_stream(trees)
-        between()
-        with wp.ScopedStream(trees):
-            self._integrate(step)
-        beside.integrate()
-        stream.wait_stream(trees)
+        for _ in range(steps):
+            with wp.ScopedStream(self._second_stream):  # waits for the stream
+                step.predict(self._whole_groups)
+            beside.predict()
+            stream.wait_stream(self._second_stream)
+            between()
+            with wp.ScopedStream(self._second_stream):
+                self._integrate(step)
+            beside.integrate()
+            stream.wait_stream(self._second_stream)
+
+    @functools.cached_property
+    def _second_stream(self) -> wp.Stream:
+        return wp.Stream(self._buffers.device)
 
 
 def _levels(steps: np.ndarray) -> Levels:
