@@ -225,7 +225,7 @@ def close_blades(
                         force = force + cuts_out.force[bunch] * force_share(depth, blade.power)
         needed = wp.max(needed, force * blade.factor)
     needed_out[world] = wp.float32(needed)
-    if needed > blade.force:
+    if needed > blade.force or not wp.isfinite(needed):
         for tree in range(world, trees, worlds):
             for k in range(wood.tree_start[tree], wood.tree_start[tree + 1]):
                 bunch = wood.of_tree[k]
