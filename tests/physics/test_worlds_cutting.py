@@ -1,5 +1,7 @@
 """Blades in batches of worlds: what they cut off moves as in a client, in its own world only."""
 
+from typing import Any
+
 import mujoco
 import numpy as np
 import pytest
@@ -9,6 +11,8 @@ from vinesim.bench import scenes
 from vinesim.core import frames
 from vinesim.interaction import cutting_force
 from vinesim.interaction.blades import Blade
+from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.plants.device_buffers import DeviceBuffers
 from vinesim.scene.model import Model
 from vinesim.scene.values import RobotSpec
 from vinesim.world import Physics
@@ -228,8 +232,12 @@ def test_a_bunch_for_which_there_is_no_body_hangs_on_and_is_the_fault_of_its_wor
     roomy = Worlds(bunches(4), 2, robots=[HAND], parameters=PARAMETERS, blade=blade(), bunches=2)
     assert roomy.pool is not None
     roomy.pool.closing.assign(np.array([True, False]))
+    roomy.step()
     roomy.step(30)
     assert roomy.pool.is_free.numpy().tolist() == [1, 0, 1, 0]
+    first, second = (roomy.bodies.data.xpos.numpy()[0, body] for body in roomy.pool.body)
+    np.testing.assert_array_equal(first, second)
+    assert first[2] == pytest.approx(scenes.HEIGHT - 0.08 - 0.5 * 9.81 * 0.3**2, abs=0.03)
     assert not roomy.faults.numpy().any()
 
 
@@ -287,6 +295,30 @@ def share_kernel(depth: wp.array(dtype=wp.float64), power: wp.float64, found_out
 def test_blades_that_a_batch_cannot_have_are_refused(cutter: Blade, number: int, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Worlds(bunches(1), 1, robots=[HAND], parameters=PARAMETERS, blade=cutter, bunches=number)
+
+
+@pytest.mark.slow
+def test_cuts_are_the_same_to_the_bit_in_the_order_of_bodies_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four trees lie side by side in the kernels' arrays. Canes of a world are 2 cm apart, and both are cut."""
+    model = bunches(12)
+    model.tree_pose[6:, 1] += 0.02
+
+    def moved() -> list[np.ndarray]:
+        worlds = Worlds(model, 6, robots=[HAND], parameters=PARAMETERS, blade=blade(), bunches=2, slots=32)
+        found = run(worlds, 0, 60, {40: [1, 4], 50: [3]})
+        assert worlds.pool is not None
+        assert worlds.pool.is_free.numpy().reshape(2, 6).sum(0).tolist() == [0, 2, 0, 2, 2, 0]
+        assert not worlds.faults.numpy().any()
+        return [found[0], *found[2:]]
+
+    expected = moved()
+
+    def interleaved(*given: Any, device: str) -> ArticulationSolver:
+        return ArticulationSolver(*given, buffers=DeviceBuffers(device, 4))
+
+    monkeypatch.setattr("vinesim.worlds.worlds.ArticulationSolver", interleaved)
+    for one, other in zip(expected, moved(), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.slow

@@ -27,6 +27,7 @@ from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.plants.segment_parts import SHORTEST
 from vinesim.rigid.free_bunch import FreeBunch, slot_name
 from vinesim.rigid.rigid_world import RigidWorld
+from vinesim.rigid.static_world import FREE_BUNCH
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spare_bodies import PLACE_STEP
@@ -37,8 +38,8 @@ OWN = tuple(struct_fields(kernels.WarpModel))
 """Arrays of mujoco_warp's model of which each world of a batch with a pool has rows of its own."""
 PARKING_HEIGHT = 100.0
 """[m] Height at which unused bodies are held, away from everything that they could touch."""
-SPARE_RADIUS = 1e-3
-"""[m] Radius of shapes that a bunch has not, inside its first sphere."""
+SPARE = 1e-3
+"""[m] Size of shapes that a bunch has not, inside its first sphere."""
 
 
 class BunchPool:
@@ -191,7 +192,7 @@ class BunchPool:
         numbers.dofs = self._bodies.rigid.mj_model.nv
         numbers.stub_mass, numbers.ghost_share = STUB_MASS, GHOST_SHARE
         numbers.shortest, numbers.place_step = SHORTEST, PLACE_STEP
-        numbers.rolling_arm, numbers.spare_radius = parameters.bunch_rolling_arm, SPARE_RADIUS
+        numbers.rolling_arm, numbers.spare = parameters.bunch_rolling_arm, SPARE
         arrays = self._plants.launches.resident_arrays
         data = self._bodies.data
         contacts = self._contacts
@@ -279,3 +280,7 @@ def add_pool(rigid: RigidWorld, slots: int) -> None:
         radius=np.full(len(start), 0.01),
     )
     rigid.add_bunches({slot: (template, parking_pose(slot), np.zeros(6)) for slot in range(slots)})
+    # bunches may hang in each other, because plants of a world do not touch. If they touched as free bodies, the solver
+    # of mujoco_warp would fail in single precision
+    m = rigid.mj_model
+    m.geom_conaffinity[(m.geom_contype & FREE_BUNCH) != 0] &= ~FREE_BUNCH

@@ -16,6 +16,9 @@ from vinesim.kernels.worlds.reset import BUNCHES
 
 wp.set_module_options({"enable_backward": False})
 
+NEVER = wp.constant(-1.0)
+"""[m] Margin of shapes that touch nothing."""
+
 
 @wp.struct
 class PoolNumbers:
@@ -39,8 +42,8 @@ class PoolNumbers:
     """[m] Places of cuts are multiples of this."""
     rolling_arm: wp.float64
     """[m] Lever arm of the rolling resistance of the thickest shape."""
-    spare_radius: wp.float64
-    """[m] Radius of shapes that a bunch has not; they are inside its first sphere."""
+    spare: wp.float64
+    """[m] Size of shapes that a bunch has not; they are inside its first sphere."""
 
 
 @wp.struct
@@ -77,6 +80,7 @@ class WarpModel:
     geom_rbound: wp.array2d(dtype=float)
     geom_aabb: wp.array3d(dtype=wp.vec3)
     geom_friction: wp.array2d(dtype=wp.vec3)
+    geom_margin: wp.array2d(dtype=float)
 
 
 @wp.struct
@@ -199,6 +203,7 @@ def write_geom(
     friction = model_out.geom_friction[world, g]
     friction[2] = wp.float32(numbers.rolling_arm * radius / widest)
     model_out.geom_friction[world, g] = friction
+    model_out.geom_margin[world, g] = 0.0
     model_out.geom_size[world, g] = wp.vec3(thin, wp.float32(half), 0.0)
     model_out.geom_pos[world, g] = to_single(wp.float64(0.5) * (start + end))
     model_out.geom_quat[world, g] = wxyz(turn)
@@ -208,6 +213,17 @@ def write_geom(
     geoms_out.size[row] = wp.vec3d(radius, half, wp.float64(0.0))
     geoms_out.half[row] = wp.vec3d(radius, radius, radius + half)
     geoms_out.radius[row] = radius + half
+
+
+@wp.func
+def write_spare_geom(
+    world: int, g: int, row: int, place: wp.vec3d, numbers: PoolNumbers, model_out: WarpModel, geoms_out: Geoms
+):
+    """Let MuJoCo geom ``g`` of a world touch nothing: a small shape inside a bunch, with a margin below which no two
+    geoms overlap."""
+    end = place + wp.vec3d(numbers.spare, wp.float64(0.0), wp.float64(0.0))
+    write_geom(world, g, row, place, end, numbers.spare, numbers.spare, numbers, model_out, geoms_out)
+    model_out.geom_margin[world, g] = NEVER
 
 
 @wp.func
@@ -282,7 +298,7 @@ def write_spheres(
     while count < numbers.spheres:
         g = first + count
         geom_row = (row + count) * numbers.worlds + world
-        write_geom(world, g, geom_row, middle, middle, numbers.spare_radius, widest, numbers, model_out, geoms_out)
+        write_spare_geom(world, g, geom_row, middle, numbers, model_out, geoms_out)
         count = count + 1
     return middle, widest
 
@@ -403,7 +419,7 @@ def detach_bunch(
         g = first + pieces
         geom_row = (row + pieces) * numbers.worlds + world
         if k < 0:
-            write_geom(world, g, geom_row, middle, middle, numbers.spare_radius, widest, numbers, model_out, geoms_out)
+            write_spare_geom(world, g, geom_row, middle, numbers, model_out, geoms_out)
         else:
             length = wp.float64(wood.length[k])
             mass = wp.float64(masses_out.body_mass[k])
