@@ -89,7 +89,8 @@ class BunchPool:
         self._model = bodies.fill(kernels.WarpModel, bodies.model)
         self._masses = plants.launches.fill_resident(kernels.PlantMasses)
         self._wood = self._take_wood(model)
-        self._pool, hold = self._take_pool(model)
+        self.table, hold = self._take_pool()
+        """Where the bodies of the pool are in mujoco_warp's arrays, for kernels."""
         self.hold = KernelGraph(hold, device=str(self._device))
         """Launches the kernel that holds unused bodies at their places. Call it before each step's first half."""
         cuts = self._cuts(bunches)
@@ -131,7 +132,7 @@ class BunchPool:
         wood.tree_start = self._array(starts, wp.int32)
         return wood
 
-    def _take_pool(self, model: Model) -> tuple[kernels.Pool, KernelLaunch]:
+    def _take_pool(self) -> tuple[kernels.Pool, KernelLaunch]:
         m = self._bodies.rigid.mj_model
         body = self.body
         joint = m.body_jntadr[body]
@@ -196,7 +197,7 @@ class BunchPool:
         arrays = self._plants.launches.resident_arrays
         data = self._bodies.data
         contacts = self._contacts
-        given = [numbers, self._pool, self._wood, arrays["body_parent"], cuts, arrays["body_q"], arrays["body_qd"]]
+        given = [numbers, self.table, self._wood, arrays["body_parent"], cuts, arrays["body_q"], arrays["body_qd"]]
         written = [
             self.is_free,
             contacts.free,
