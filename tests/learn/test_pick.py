@@ -59,26 +59,31 @@ def test_the_fingers_open_and_close_with_their_action(environment: Any) -> None:
         np.testing.assert_allclose(observation[:, OPENING], opening, atol=2e-3)
 
 
-def test_a_hand_that_knows_the_stalks_picks_both_bunches(environment: Any) -> None:
-    """It comes to 5 cm in front of the stalk, goes on until the stalk is between the fingers, closes them for 0.4 s,
-    and cuts. Each bunch comes off with the action that cuts, and is held for 0.2 s."""
-    observation, _ = environment.reset(seed=1)
-    ahead = directions(environment, observation)
-    stage = np.full(2, APPROACH)
-    since = np.zeros(2, int)
-    cut_at, succeeded_at = np.full((2, 2), -1)
+def pick(env: Any, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Let a controller that knows the stalks pick a bunch in each world. Returns the actions [world] with which the
+    bunches came off, and those with which the worlds succeeded; -1: none.
+
+    The hand comes to 5 cm in front of the stalk, goes on until the stalk is between the fingers, closes them for 0.4 s,
+    and cuts.
+    """
+    observation, _ = env.reset(seed=seed)
+    worlds = len(observation)
+    ahead = directions(env, observation)
+    stage = np.full(worlds, APPROACH)
+    since = np.zeros(worlds, int)
+    cut_at, succeeded_at = np.full((2, worlds), -1)
     for k in range(150):
         to_stalk = observation[:, STALK]
         ways = to_stalk + np.where(stage == APPROACH, -0.05, 0.01)[:, None] * ahead
         apart = np.linalg.norm(ways, axis=1)
-        action = np.zeros((2, 9), np.float32)
-        action[:, :7] = np.where((stage < SQUEEZE)[:, None], towards(environment, ways, 8.0, ahead), 0.0)
+        action = np.zeros((worlds, 9), np.float32)
+        action[:, :7] = np.where((stage < SQUEEZE)[:, None], towards(env, ways, 8.0, ahead), 0.0)
         action[:, 7] = np.where(stage < SQUEEZE, -0.5, 1.0)
         action[:, 8] = stage == CUT
-        observation, reward, terminated, _, info = environment.step(action)
+        observation, reward, terminated, _, info = env.step(action)
         running = succeeded_at < 0
-        off = info.get("final_obs", observation)[:, HANGS] == 0.0
-        for world in np.flatnonzero(running & off & (cut_at < 0)):
+        seen = info.get("final_obs", observation)
+        for world in np.flatnonzero(running & (seen[:, HANGS] == 0.0) & (cut_at < 0)):
             cut_at[world] = k
             assert stage[world] == CUT
             assert 1.5 < reward[world] < 2.0, "the reward for the cut, without costs"
@@ -86,7 +91,7 @@ def test_a_hand_that_knows_the_stalks_picks_both_bunches(environment: Any) -> No
             succeeded_at[world] = k
             assert reward[world] > 9.0
             assert terminated[world]
-            assert np.linalg.norm(info["final_obs"][world, STALK]) < 0.05
+            assert np.linalg.norm(seen[world, STALK]) < 0.05
             assert observation[world, HANGS] == 1.0, "the next episode begins with a bunch that hangs"
         goes_on = np.select(
             [stage == APPROACH, stage == GRASP, stage == SQUEEZE, stage == CUT],
@@ -97,9 +102,21 @@ def test_a_hand_that_knows_the_stalks_picks_both_bunches(environment: Any) -> No
         stage = stage + goes_on
         if (succeeded_at >= 0).all():
             break
+    assert not env.unwrapped.worlds.faults.numpy().any()
+    return cut_at, succeeded_at
+
+
+def test_a_hand_that_knows_the_stalks_picks_both_bunches(environment: Any) -> None:
+    cut_at, succeeded_at = pick(environment, seed=1)
     assert (cut_at >= 0).all()
     assert (succeeded_at >= cut_at + 4).all()
-    assert not environment.unwrapped.worlds.faults.numpy().any()
+
+
+def test_it_picks_most_bunches_of_twelve_worlds() -> None:
+    """The other bunches are out of the reach of a hand that is upright, or their canes are in the blade's mouth."""
+    env = gymnasium.make_vec("vinesim/Pick-v0", num_envs=12)
+    picked = [int((pick(env, seed)[1] >= 0).sum()) for seed in (1, 2)]
+    assert min(picked) >= 9
 
 
 def test_a_bunch_that_is_cut_but_not_held_is_no_success(environment: Any) -> None:
