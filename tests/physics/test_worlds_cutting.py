@@ -13,6 +13,7 @@ from vinesim.interaction import cutting_force
 from vinesim.interaction.blades import Blade
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.plants.device_buffers import DeviceBuffers
+from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.values import RobotSpec
 from vinesim.world import Physics
@@ -239,6 +240,29 @@ def test_a_bunch_for_which_there_is_no_body_hangs_on_and_is_the_fault_of_its_wor
     np.testing.assert_array_equal(first, second)
     assert first[2] == pytest.approx(scenes.HEIGHT - 0.08 - 0.5 * 9.81 * 0.3**2, abs=0.03)
     assert not roomy.faults.numpy().any()
+
+
+@pytest.mark.slow
+def test_stalks_of_different_thickness_take_the_force_of_a_client_together() -> None:
+    """The stalks of two canes at nearly the same place are 4 and about 2.6 mm thick. The forces of the two cuts are
+    largest at different gaps between the edges, so that together they take less than their sum."""
+    model = bunches(2)
+    model.tree_pose[1, 1] += 0.01
+    thin = np.arange(len(model.body_mass)) >= len(model.body_mass) // 2
+    model.body_radius[thin & (model.body_organ == int(Organ.PEDUNCLE))] = [0.0014, 0.0012]
+    physics = client(model, HAND)
+    cutter = physics.add_blade("hand", "palm", MOUTH, HALF, force=200.0)
+    worlds = Worlds(model, 1, robots=[HAND], parameters=PARAMETERS, blade=blade(), bunches=2)
+    assert worlds.pool is not None
+    cutter.close()
+    worlds.pool.closing.fill_(True)
+    physics.step()
+    worlds.step()
+    assert len(cutter.detachments) == worlds.pool.is_free.numpy().sum() == 2
+    thickness = 0.0028 - 0.0004 * cutter.detachments[1].at / 0.04
+    most = sum(cutting_force.shear_force(diameter, 4.8e6) for diameter in (0.004, thickness))
+    assert 0.9 * most < cutter.resistance < 0.999 * most
+    assert worlds.pool.needed.numpy()[0] == pytest.approx(cutter.resistance, rel=1e-5)
 
 
 @pytest.mark.slow
