@@ -36,8 +36,8 @@ class PickEnv(ArmEnv):
 
     Action [9], from -1 to 1: the speeds of the targets of the seven joints, in units of 1 rad/s; where the fingers
     go, from open (-1) to closed (1), at 0.15 m/s; and the blade, which closes at the end of the action if this
-    component is above 0. The hand grasps the stalk of a bunch between its fingers, and the blade cuts above them. The bunch then
-    hangs from the fingers.
+    component is above 0. The hand grasps the stalk of a bunch between its fingers, and the blade cuts above them. The
+    bunch then hangs from the fingers.
 
     Observation [28] float32: positions [rad] of the seven joints; their rates [rad/s]; how much farther apart the
     fingers are than in the middle of their way [m]; from the point between the fingers to the middle of the wanted
