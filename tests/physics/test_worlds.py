@@ -127,7 +127,7 @@ def test_a_world_that_explodes_is_found_and_reset_and_the_others_do_not_notice(
             worlds.bodies.targets.assign(np.array([targets(tick, 0.1)] * 4, np.float32))
             worlds.step(2)
         worlds.download()
-        return worlds.plants.state.joint_q.reshape(4, -1, 4).copy(), worlds.bodies.data.qpos.numpy()
+        return worlds.plants.state.joint_q.reshape(4, -1, 4).copy(), worlds.bodies.data.qpos.numpy().copy()
 
     worlds.reset()
     run(0, 40)

@@ -79,7 +79,7 @@ def force_share(depth: float | np.ndarray, share: float = CHORD_ENERGY_SHARE) ->
     paper shows force over depth.
     """
     inside = np.clip(np.asarray(depth, float), 0.0, 1.0)
-    return np.asarray((4.0 * inside * (1.0 - inside)) ** _power(share))
+    return np.asarray((4.0 * inside * (1.0 - inside)) ** energy_exponent(share))
 
 
 def energy_to_depth(depth: float | np.ndarray, share: float = CHORD_ENERGY_SHARE) -> np.ndarray:
@@ -124,7 +124,7 @@ def saw_time(diameter: float) -> float:
 
 
 @functools.cache
-def _power(share: float) -> float:
+def energy_exponent(share: float) -> float:
     """Returns the power p with which the integral of (4 s (1 - s))^p over s from 0 to 1 is ``share``. Raises
     :class:`ValueError` unless the share is between 0.01 and 1."""
     if not 0.01 <= share < 1.0:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import pathlib
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from vinesim.learn.arm_arrays import ArmArrays, arrays_of_worlds
 from vinesim.learn.task_env import TaskEnv, check_options
 from vinesim.learn.variation import Variation, as_variation
 from vinesim.scene.model import Model
+from vinesim.scene.values import RobotSpec
 from vinesim.worlds.plants import plants_of_worlds
 from vinesim.worlds.worlds import Worlds
 
@@ -44,6 +46,9 @@ class ArmEnv(TaskEnv):
         vines: number of different groups of plants; further worlds repeat them.
         variation: ranges of these numbers, or a TOML file with them.
         max_episode_steps: number of actions after which an episode is truncated.
+        robot: the robot, whose first drives are the seven joints; None: :func:`~vinesim.learn.arm.arm`.
+        actions: number of an action's components, if the task has more.
+        options: further arguments of :class:`~vinesim.worlds.worlds.Worlds`.
     """
 
     def __init__(
@@ -59,6 +64,9 @@ class ArmEnv(TaskEnv):
         variation: Variation | str | pathlib.Path = Variation(),
         max_episode_steps: int = MAX_EPISODE_STEPS,
         render_mode: str | None = None,
+        robot: RobotSpec | None = None,
+        actions: int = len(AXES),
+        **options: Any,
     ) -> None:
         check_options(num_envs, arrays, render_mode)
         ranges = as_variation(variation)
@@ -66,8 +74,14 @@ class ArmEnv(TaskEnv):
             plants(np.random.default_rng([vines_seed, number]), ranges) for number in range(min(num_envs, vines))
         ]
         super().__init__(
-            Worlds(plants_of_worlds(variants, num_envs), num_envs, robots=[arm(BASE, HOME)], device=device),
-            len(AXES),
+            Worlds(
+                plants_of_worlds(variants, num_envs),
+                num_envs,
+                robots=[arm(BASE, HOME) if robot is None else robot],
+                device=device,
+                **options,
+            ),
+            actions,
             numbers,
             device=device,
             arrays=arrays,

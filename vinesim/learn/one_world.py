@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 
 from vinesim.learn.expose import ExposeEnv
+from vinesim.learn.pick import PickEnv
 from vinesim.learn.reach import ReachEnv
 from vinesim.learn.task_env import TaskEnv
 
@@ -51,3 +52,10 @@ class ExposeOne(OneWorld):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(ExposeEnv(1, **options))
+
+
+class PickOne(OneWorld):
+    """:class:`PickEnv` with one world. ``options``: arguments of :class:`PickEnv` except ``num_envs``, ``arrays``."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(PickEnv(1, **options))

@@ -21,7 +21,7 @@ from vinesim.kernels.contact.distance import CAPSULE, PLANE, SPHERE
 from vinesim.kernels.contact.friction_law import Surface
 from vinesim.kernels.graph import THREADS_PER_BLOCK, KernelGraph, KernelLaunch
 from vinesim.kernels.plants import structs as plant_structs
-from vinesim.kernels.worlds import contact_step, delassus, narrowphase, reset, rigid_state
+from vinesim.kernels.worlds import contact_step, delassus, free_bunches, narrowphase, reset, rigid_state
 from vinesim.kernels.worlds.dense_solver import WorldSearch, WorldSystem
 from vinesim.kernels.worlds.views import GROUP
 from vinesim.plants.articulation_solver import ArticulationSolver
@@ -201,6 +201,12 @@ class BatchContacts:
             KernelLaunch(broadphase.geom_aabbs, arguments, [self._geom_states], threads=len(given["id"])),
             device=str(device),
         )()
+        self.free = narrowphase.FreeBunches()
+        """Bunches that have left their vines."""
+        slots = max(int(rigid.bunch_of_geom.max(initial=-1)) + 1, 1)
+        self.free.bunch = wp.full((self.worlds, slots), -1, dtype=wp.int32, device=device)
+        self.free.passing = self._zeros(wp.int32, self._trees, slots)
+        self.free.slot = wp.array(rigid.bunch_of_geom[:moving], dtype=wp.int32, device=device)
         low, high = (getattr(self._geom_states, name).numpy() for name in ("low", "high"))
         low[given["kind"] == PLANE, 2] = -PLANE_HALF_SIZE
         self._geom_states.low.assign(low)
@@ -338,11 +344,28 @@ class BatchContacts:
                     parameters,
                     self._geoms,
                     *shape,
+                    self.free,
                     self._rigid_bodies,
                     self._geom_states,
                     self._world_boxes,
                 ),
             ]
+        if (self.free.slot.numpy() >= 0).any():
+            launches.append(
+                self._launch(
+                    free_bunches.end_passing,
+                    trees,
+                    worlds,
+                    trees,
+                    self._capsules,
+                    self._geoms,
+                    self._hulls,
+                    self._bodies,
+                    self._rigid_bodies,
+                    self._geom_states,
+                    self.free,
+                )
+            )
         return [
             *launches,
             self._launch(
@@ -357,6 +380,7 @@ class BatchContacts:
                 self._geom_states,
                 self._world_boxes,
                 self._static_blocks,
+                self.free,
                 self._capsule_states,
                 contacts,
             ),
@@ -591,6 +615,17 @@ class BatchContacts:
     def lists(self) -> tuple[structs.Contacts, narrowphase.WorldContacts]:
         """Returns the contacts of the last step, for kernels: entry i of a world is at ``i * worlds + world``."""
         return self.contacts, self._world_contacts
+
+    @property
+    def geoms(self) -> structs.Geoms:
+        """Geoms that plants touch, for kernels: geom m of a world that can move is at ``m * worlds + world``; static
+        geoms follow."""
+        return self._geoms
+
+    @property
+    def rigid_bodies(self) -> structs.RigidBodies:
+        """MuJoCo's arrays of all worlds as the contacts read them, for kernels."""
+        return self._rigid_bodies
 
     @property
     def capsules(self) -> structs.Capsules:

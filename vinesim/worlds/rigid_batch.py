@@ -10,6 +10,7 @@ Unlike in a client, contacts between rigid bodies have no speculative margins, a
 from __future__ import annotations
 
 import copy
+from collections.abc import Collection
 from typing import Any
 
 import mujoco
@@ -25,6 +26,8 @@ from vinesim.worlds.errors import MissingExtra
 
 DEFAULT_CONTACTS = 16
 """Default for the number of contacts between rigid bodies for which there is room, per world."""
+BUNCH_CONTACTS = 12
+"""The same for each body of a pool for free bunches: as many as it has shapes."""
 ROWS_PER_CONTACT = 6
 """Room for rows of constraints per contact; MuJoCo's contacts have 1, 3, 4 or 6 rows."""
 
@@ -53,20 +56,33 @@ class RigidBatch:
         count: number of worlds.
         device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
         contacts: number of contacts between rigid bodies of a world for which there is room, on average.
+        own: names of arrays of mujoco_warp's model of which each world has rows of its own.
     """
 
-    def __init__(self, rigid: RigidWorld, count: int, device: str = "cpu", *, contacts: int = DEFAULT_CONTACTS) -> None:
+    def __init__(
+        self,
+        rigid: RigidWorld,
+        count: int,
+        device: str = "cpu",
+        *,
+        contacts: int = DEFAULT_CONTACTS,
+        own: Collection[str] = (),
+    ) -> None:
         self.rigid = rigid
         self.count = count
         self.device = wp.get_device(device)
         self._mjw = _mujoco_warp()
         m = copy.copy(rigid.mj_model)
         m.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+        m.tree_sleep_policy[:] = int(
+            mujoco.mjtSleepPolicy.mjSLEEP_AUTO_ALLOWED
+        )  # mujoco_warp has none that begins asleep
         m.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # mujoco_warp never resets by itself
         rigid.update_kinematics()
+        contacts += BUNCH_CONTACTS * len(rigid.free_bunches)
         limits = int(m.jnt_limited.sum() + m.neq * ROWS_PER_CONTACT + (m.dof_frictionloss > 0.0).sum())
         with wp.ScopedDevice(self.device):
-            self.model = self._mjw.put_model(m)
+            self.model = self._mjw.put_model(m, dict.fromkeys(own, count))
             # Newton's method finds the acceleration without constraints, too; its own solver takes longer than a step
             self.model.opt.run_qacc_smooth = False
             self.data = self._mjw.put_data(
@@ -153,11 +169,12 @@ class RigidBatch:
         data = self.data
         return [data.qpos, data.qvel, data.qacc, data.qacc_warmstart, data.act, data.ctrl, data.qfrc_applied]
 
-    def fill(self, struct: Any) -> Any:
-        """Returns a Warp struct whose fields are arrays of mujoco_warp with the same names."""
+    def fill(self, struct: Any, source: Any = None) -> Any:
+        """Returns a Warp struct whose fields are arrays of mujoco_warp with the same names: of its data, or of
+        ``source``."""
         made = struct()
         for name in struct_fields(struct):
-            setattr(made, name, getattr(self.data, name))
+            setattr(made, name, getattr(self.data if source is None else source, name))
         return made
 
     def effective_mass(self) -> EffectiveMass:

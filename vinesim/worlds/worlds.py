@@ -4,7 +4,7 @@ A step has the stages of :class:`vinesim.world.Physics`: both sides predict thei
 are found and solved together, both sides integrate. Nothing is copied between host and GPU during a step.
 
 What a client's world has and a batch does not: contacts between plants, wires and arms that deform, hands of people,
-wood that cracks, sleep, and bunches with moving berry clusters.
+wood that breaks or is cut (except peduncles that a blade cuts), sleep, and bunches with moving berry clusters.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 import warp as wp
 
+from vinesim.interaction.blades import Blade
 from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.worlds.reset import find_faults, forget_faults, restore_rows, restore_worlds
 from vinesim.plants.articulation_solver import TREE_RESULTS, ArticulationSolver, Beside
@@ -24,6 +25,7 @@ from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
 from vinesim.scene.values import RobotSpec
 from vinesim.worlds.batch_contacts import FULL_BLOCK, BatchContacts
+from vinesim.worlds.bunch_pool import OWN, BunchPool, add_pool
 from vinesim.worlds.rigid_batch import RigidBatch
 
 DEFAULT_SLOTS = 16
@@ -42,6 +44,8 @@ def _as_table(rows: wp.array) -> wp.array:
     Integers appear as floating-point numbers with the same bits, which is enough for copies.
     """
     width = rows.strides[0] // 4
+    if width == 0:
+        raise TypeError(f"an array of {rows.dtype}: give numbers of four bytes")
     return wp.array(ptr=rows.ptr, shape=(len(rows), width), dtype=float, device=rows.device)
 
 
@@ -57,8 +61,11 @@ class Worlds:
         device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
         slots: number of contacts that the plants of one world can have at once. Further contacts are left out, and
             counted in :attr:`dropped`.
+        blade: the blade of one of the robots, which can cut peduncles. None: nothing is cut.
+        bunches: number of bunches that can come off in each world.
 
-    Raises :class:`ValueError` if the number of trees does not fit or a tree needs substeps,
+    Raises :class:`ValueError` if the number of trees does not fit or a tree needs substeps, or for a blade that a batch
+    cannot have (see :class:`~vinesim.worlds.bunch_pool.BunchPool`),
     :class:`~vinesim.worlds.errors.MissingExtra` without mujoco_warp.
     """
 
@@ -71,6 +78,8 @@ class Worlds:
         parameters: PhysicsParameters = PhysicsParameters(),
         device: str = "cpu",
         slots: int = DEFAULT_SLOTS,
+        blade: Blade | None = None,
+        bunches: int = 1,
     ) -> None:
         parameters = msgspec.structs.replace(parameters, sleep=False, bunch_pool_size=0)
         self.model = model
@@ -79,7 +88,9 @@ class Worlds:
         rigid = RigidWorld(model, parameters=parameters)
         for robot in robots:
             rigid.add_robot(robot)
-        self.bodies = RigidBatch(rigid, count, device)
+        if blade is not None:
+            add_pool(rigid, bunches)
+        self.bodies = RigidBatch(rigid, count, device, own=() if blade is None else OWN)
         """Robots and boxes."""
         self.plants = ArticulationSolver(model, State.at_rest(model), parameters, device=device)
         """Trees."""
@@ -91,11 +102,17 @@ class Worlds:
         self._resets = wp.zeros(count, dtype=wp.bool, device=device)
         self.faults = wp.zeros(count, dtype=wp.int32, device=device)
         """[world] What has gone wrong since the world's last reset: a sum of
-        :data:`~vinesim.kernels.worlds.reset.MOTION` (a number is not finite, or a rate too high) and
-        :data:`~vinesim.kernels.worlds.reset.ROOM` (contacts were left out). 0: nothing. A world with a fault goes on
-        as it can, until it is reset."""
+        :data:`~vinesim.kernels.worlds.reset.MOTION` (a number is not finite, or a rate too high),
+        :data:`~vinesim.kernels.worlds.reset.ROOM` (contacts were left out) and
+        :data:`~vinesim.kernels.worlds.reset.BUNCHES` (a bunch was cut off for which the pool has no body). 0: nothing.
+        A world with a fault goes on as it can, until it is reset."""
         self.fault_count = wp.zeros(count, dtype=wp.int32, device=device)
         """[world] Number of times since the start that a world without faults got one."""
+        self.pool: BunchPool | None = None
+        """Bunches that come off; None without a blade."""
+        if blade is not None:
+            state = (self.faults, self.fault_count)
+            self.pool = BunchPool(self.plants, self.bodies, self.contacts, blade, *state)
         self._check = self._check_graph(device)
         self._reset = self._reset_graph(device)
 
@@ -108,12 +125,17 @@ class Worlds:
         state = [(array, trees) for array in of_trees]
         state += [(arrays[name], arrays["body_tree"]) for name in _BODY_STATE]
         launches = []
+        of_worlds = []
+        if self.pool is not None:
+            state += self.pool.of_trees()
+            of_worlds += [_as_table(array) for array in self.pool.of_worlds()]
         for array, tree in state:
             rows = _as_table(array)
             given = [self.count, self._resets, tree, wp.clone(rows)]
             launches.append(KernelLaunch(restore_rows, given, [rows], threads=rows.shape[0], width=rows.shape[1]))
         bodies = self.bodies
-        for rows in (*bodies.state_arrays(), bodies.targets, bodies.base_velocity, bodies.base_targets):
+        of_worlds += [*bodies.state_arrays(), bodies.targets, bodies.base_velocity, bodies.base_targets]
+        for rows in of_worlds:
             if rows.size:
                 given = [self._resets, wp.clone(rows)]
                 launches.append(KernelLaunch(restore_worlds, given, [rows], threads=self.count, width=rows.shape[1]))
@@ -163,9 +185,14 @@ class Worlds:
         """Advance all worlds by ``steps`` steps."""
         self.plants.advance(steps, self.contacts.solve, Beside(self._predict_bodies, self.bodies.integrate))
         self._check()
+        if self.pool is not None:
+            self.bodies.update_kinematics()
+            self.pool.update()
 
     def _predict_bodies(self) -> None:
         self._check()  # of the step before
+        if self.pool is not None:
+            self.pool.hold()
         self.bodies.predict()
 
     def download(self) -> None:

@@ -11,7 +11,7 @@ from vinesim.cli.commands.options import Device
 
 
 def train(
-    task: Annotated[str, typer.Argument(help="reach or expose.")],
+    task: Annotated[str, typer.Argument(help="reach, expose or pick.")],
     out: Annotated[
         pathlib.Path | None, typer.Option(help="Folder for policy.npz, curve.csv and summary.json of a training.")
     ] = None,

@@ -73,6 +73,18 @@ class WorldContacts:
     """[i * worlds + world] Bodies on which the wrenches of the last contacts act."""
 
 
+@wp.struct
+class FreeBunches:
+    """Bunches that have left their vines. Each is a body of its world's pool."""
+
+    bunch: wp.array2d(dtype=wp.int32)
+    """[world, slot] Bunch that this body of the pool is; -1: the body is not used."""
+    passing: wp.array2d(dtype=wp.int32)
+    """[tree, slot] 1 if the bunch passes through the tree, because it has overlapped it since it left its vine; else 0."""
+    slot: wp.array(dtype=wp.int32)
+    """[m] Body of the pool that the moving geom m belongs to; -1 for none."""
+
+
 @wp.kernel
 def move_geoms(
     # model
@@ -83,13 +95,14 @@ def move_geoms(
     moving: int,
     rigid_bodies: int,
     dofs: int,
+    free: FreeBunches,
     rigid: RigidBodies,
     # out
     geom_states_out: GeomStates,
     world_boxes_out: Aabbs,
 ):
     """One thread per world. Compute the motion and the bounding box of each of the world's ``moving`` geoms that can
-    move, and a common box of all of them [world]."""
+    move, and a common box of all of them [world]. Geoms of unused bodies of the pool have empty boxes."""
     world = wp.tid()
     own = part_of_rigid(rigid, world, rigid_bodies, dofs)
     low = wp.vec3(FAR)
@@ -97,6 +110,10 @@ def move_geoms(
     for m in range(moving):
         g = m * worlds + world
         geom_motion(g, parameters, geoms, own, geom_states_out)
+        slot = free.slot[m]
+        if slot >= 0 and free.bunch[world, wp.max(slot, 0)] < 0:
+            geom_states_out.low[g] = wp.vec3(FAR)
+            geom_states_out.high[g] = wp.vec3(-FAR)
         low = wp.min(low, geom_states_out.low[g])
         high = wp.max(high, geom_states_out.high[g])
     world_boxes_out.low[world] = low
@@ -113,8 +130,16 @@ def list_pair(s: int, g: int, near_count: int, room: int, world_contacts_out: Wo
 
 
 @wp.func
+def is_passing(g: int, tree: int, worlds: int, free: FreeBunches):
+    """Returns whether a moving geom passes through a tree."""
+    slot = free.slot[g / worlds]
+    return slot >= 0 and free.passing[tree, wp.max(slot, 0)] != 0
+
+
+@wp.func
 def list_near_geoms(
     s: int,
+    tree: int,
     world: int,
     worlds: int,
     near_count: int,
@@ -125,6 +150,7 @@ def list_near_geoms(
     geom_states: GeomStates,
     world_boxes: Aabbs,
     static_blocks: Aabbs,
+    free: FreeBunches,
     world_contacts_out: WorldContacts,
 ):
     """List the geoms whose boxes overlap the box of capsule ``s``. Returns the new number of near pairs of the tree.
@@ -134,7 +160,8 @@ def list_near_geoms(
     movable = geoms.count[0]
     if movable > 0 and not aabbs_disjoint(low, high, world_boxes.low[world], world_boxes.high[world]):
         for g in range(world, movable, worlds):
-            if not aabbs_disjoint(low, high, geom_states.low[g], geom_states.high[g]):
+            is_near = not aabbs_disjoint(low, high, geom_states.low[g], geom_states.high[g])
+            if is_near and not is_passing(g, tree, worlds, free):
                 list_pair(s, g, near_count, room, world_contacts_out)
                 near_count = near_count + 1
     for block in range(static_blocks.low.shape[0]):
@@ -160,6 +187,7 @@ def list_near_pairs(
     geom_states: GeomStates,
     world_boxes: Aabbs,
     static_blocks: Aabbs,
+    free: FreeBunches,
     # out
     capsule_states_out: CapsuleStates,
     world_contacts_out: WorldContacts,
@@ -187,6 +215,7 @@ def list_near_pairs(
             before = near_count
             near_count = list_near_geoms(
                 s,
+                tree,
                 world,
                 worlds,
                 before,
@@ -197,6 +226,7 @@ def list_near_pairs(
                 geom_states,
                 world_boxes,
                 static_blocks,
+                free,
                 world_contacts_out,
             )
             if near_count > before:

@@ -12,6 +12,8 @@ MOTION = wp.constant(1)
 """Fault: a number of the state is not finite, or a rate is too high."""
 ROOM = wp.constant(2)
 """Fault: contacts were left out because there was no room for them."""
+BUNCHES = wp.constant(4)
+"""Fault: a bunch that was cut off hangs on, because no body of the pool was free."""
 NO_ROOM = wp.constant(15)
 """mujoco_warp's overflow flags NEFC, NJMAX_NNZ, BROADPHASE and NARROWPHASE."""
 
@@ -37,7 +39,7 @@ def find_faults(
 
     max_rate: largest rate of rigid bodies [m/s, rad/s]. fault_rate: largest rate of trees [rad/s]. overflow: [world]
     mujoco_warp's flags. dropped_before: [world] number of dropped contacts that is known. faults: [world] sum of
-    :data:`MOTION` and :data:`ROOM`. fault_count: [world] number of times that a world without faults got one.
+    :data:`MOTION`, :data:`ROOM` and :data:`BUNCHES`. fault_count: [world] number of times that a world without faults got one.
     """
     world = wp.tid()
     moves_wrongly = bool(False)

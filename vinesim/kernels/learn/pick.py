@@ -1,0 +1,231 @@
+"""The task *pick* (:mod:`vinesim.learn.pick`): actions of the hand, observation, reward and success of each world, on the
+batch's device."""
+
+import warp as wp
+
+from vinesim.kernels.contact.structs import Contacts
+from vinesim.kernels.learn.reach import ArmState, bunch_middle, observe_arm
+from vinesim.kernels.worlds.narrowphase import WorldContacts
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class PickNumbers:
+    """Numbers of the task."""
+
+    reach: float
+    """[m] Distance of the stalk from the point between the fingers up to which the bunch is in the hand."""
+    speed: float
+    """[m/s] Speed of the bunch's middle below which it is held."""
+    actions: int
+    """Number of actions for which it must be held."""
+    cut_reward: float
+    success_reward: float
+    distance_cost: float
+    """[1/m] Cost of an action per distance."""
+    force_cost: float
+    """[1/N] Cost of an action per force on other plants."""
+    action_cost: float
+
+
+@wp.struct
+class BunchPlaces:
+    """The bunches of all worlds, on their vines and off them. [tree]: each tree has one bunch."""
+
+    body: wp.array(dtype=wp.int32)
+    """[tree] Body of the bunch on its vine."""
+    com: wp.array(dtype=wp.vec3)
+    """[tree] m, its centre of mass in its frame."""
+    segment: wp.array(dtype=wp.int32)
+    """[tree] Last segment of its peduncle."""
+    length: wp.array(dtype=float)
+    """[tree] m, length of this segment."""
+    body_q: wp.array(dtype=wp.transform)
+    slots: wp.array2d(dtype=wp.int32)
+    """[world, slot] Bunch that a body of the pool is."""
+    free_body: wp.array(dtype=wp.int32)
+    """[slot] MuJoCo body."""
+    free_v: wp.array(dtype=wp.int32)
+    """[slot] First degree of freedom in MuJoCo's qvel."""
+    xpos: wp.array2d(dtype=wp.vec3)
+    xmat: wp.array2d(dtype=wp.mat33)
+    qvel: wp.array2d(dtype=float)
+
+
+@wp.func
+def slot_of(world: int, tree: int, bunches: BunchPlaces):
+    """Returns the body of the pool that the bunch of a tree is; -1 while it hangs."""
+    found = int(-1)
+    for slot in range(bunches.slots.shape[1]):
+        if bunches.slots[world, slot] == tree:
+            found = slot
+    return found
+
+
+@wp.func
+def stalk_point(world: int, tree: int, slot: int, bunches: BunchPlaces):
+    """Returns the point [m] at which the hand shall grasp the stalk: the upper end of the last segment of the
+    peduncle."""
+    point = wp.transform_get_translation(bunches.body_q[bunches.segment[tree]])
+    if slot >= 0:
+        body = bunches.free_body[wp.max(slot, 0)]
+        point = bunches.xpos[world, body] + bunches.xmat[world, body] * wp.vec3(-bunches.length[tree], 0.0, 0.0)
+    return point
+
+
+@wp.func
+def middle_point(world: int, tree: int, slot: int, bunches: BunchPlaces):
+    """Returns the middle of a bunch [m]."""
+    point = bunch_middle(bunches.body_q, bunches.body[tree], bunches.com[tree])
+    if slot >= 0:
+        body = bunches.free_body[wp.max(slot, 0)]
+        point = bunches.xpos[world, body] + bunches.xmat[world, body] * bunches.com[tree]
+    return point
+
+
+@wp.kernel
+def move_hand(
+    # model
+    closed: float,
+    open: float,
+    step: float,
+    first: int,
+    # in
+    action: wp.array2d(dtype=float),
+    # out
+    targets_out: wp.array2d(dtype=float),
+    closing_out: wp.array(dtype=wp.bool),
+):
+    """One thread per world. Set the targets of both fingers and the command of the blade by the components ``first`` and
+    ``first + 1`` of the action.
+
+    closed, open: [m] where the targets of the fingers go at the action's ends 1 and -1, as distances from the middle of
+    their ways. step: [m] largest motion of a target in an action. targets: [world, joint]; the fingers are the joints ``first`` (left) and ``first + 1`` (right).
+    """
+    world = wp.tid()
+    share = 0.5 * (1.0 + wp.clamp(action[world, first], -1.0, 1.0))
+    before = targets_out[world, first + 1]
+    way = wp.clamp(open + share * (closed - open), before - step, before + step)
+    targets_out[world, first] = -way
+    targets_out[world, first + 1] = way
+    closing_out[world] = action[world, first + 1] > 0.0
+
+
+@wp.kernel
+def count_held(
+    # model
+    numbers: PickNumbers,
+    worlds: int,
+    # in
+    arm: ArmState,
+    bunches: BunchPlaces,
+    target: wp.array(dtype=wp.int32),
+    # out
+    held_out: wp.array(dtype=wp.int32),
+    since_out: wp.array(dtype=wp.int32),
+):
+    """One thread per world, once after each action. Count the actions since the wanted bunch has been off its vine
+    (``since`` [world]), and for how many of the last ones it has been held (``held`` [world])."""
+    world = wp.tid()
+    tree = target[world] * worlds + world
+    slot = slot_of(world, tree, bunches)
+    held = int(0)
+    since = int(0)
+    if slot >= 0:
+        since = since_out[world] + 1
+        body = bunches.free_body[wp.max(slot, 0)]
+        v = bunches.free_v[wp.max(slot, 0)]
+        velocity = wp.vec3(bunches.qvel[world, v], bunches.qvel[world, v + 1], bunches.qvel[world, v + 2])
+        spin = wp.vec3(bunches.qvel[world, v + 3], bunches.qvel[world, v + 4], bunches.qvel[world, v + 5])
+        velocity = velocity + bunches.xmat[world, body] * wp.cross(spin, bunches.com[tree])
+        point = arm.xpos[world, arm.tool_body] + arm.xmat[world, arm.tool_body] * arm.tool
+        away = stalk_point(world, tree, slot, bunches) - point
+        if wp.length(away) < numbers.reach and wp.length(velocity) < numbers.speed:
+            held = held_out[world] + 1
+    held_out[world] = held
+    since_out[world] = since
+
+
+@wp.kernel
+def forget_held(
+    # in
+    begins: wp.array(dtype=wp.bool),
+    # out
+    held_out: wp.array(dtype=wp.int32),
+    since_out: wp.array(dtype=wp.int32),
+):
+    """One thread per world. Begin an episode with a bunch that hangs."""
+    world = wp.tid()
+    if begins[world]:
+        held_out[world] = 0
+        since_out[world] = 0
+
+
+@wp.kernel
+def observe(
+    # model
+    numbers: PickNumbers,
+    worlds: int,
+    fingers: wp.array(dtype=wp.int32),
+    # in
+    arm: ArmState,
+    bunches: BunchPlaces,
+    target: wp.array(dtype=wp.int32),
+    held: wp.array(dtype=wp.int32),
+    since: wp.array(dtype=wp.int32),
+    action: wp.array2d(dtype=float),
+    contacts: Contacts,
+    world_contacts: WorldContacts,
+    # out
+    observation_out: wp.array2d(dtype=float),
+    reward_out: wp.array(dtype=float),
+    success_out: wp.array(dtype=wp.bool),
+):
+    """One thread per world.
+
+    fingers: [2] indices of the left and the right finger in MuJoCo's qpos. target: [world] number of the tree whose bunch
+    is wanted, in its world. held, since: see :func:`count_held`. observation: [world, k], as
+    :class:`vinesim.learn.pick.PickEnv` describes it.
+    """
+    world = wp.tid()
+    trees = bunches.body.shape[0] / worlds
+    point = observe_arm(world, arm, observation_out)
+    place = int(2 * arm.q.shape[0])
+    observation_out[world, place] = arm.qpos[world, fingers[0]] - arm.qpos[world, fingers[1]]
+    wanted = target[world]
+    tree = wanted * worlds + world
+    slot = slot_of(world, tree, bunches)
+    to_stalk = stalk_point(world, tree, slot, bunches) - point
+    to_middle = middle_point(world, tree, slot, bunches) - point
+    for k in range(3):
+        observation_out[world, place + 1 + k] = to_stalk[k]
+        observation_out[world, place + 4 + k] = to_middle[k]
+    observation_out[world, place + 7] = wp.where(slot < 0, 1.0, 0.0)
+    place = place + 8
+    for other in range(trees):
+        if other != wanted:
+            tree = other * worlds + world
+            offset = middle_point(world, tree, slot_of(world, tree, bunches), bunches) - point
+            for k in range(3):
+                observation_out[world, place + k] = offset[k]
+            place = place + 3
+    force = float(0.0)
+    for c in range(world_contacts.count[world]):
+        at = c * worlds + world
+        if world_contacts.tree[at] / worlds != wanted:
+            force = force + float(wp.length(contacts.force[at]))
+    observation_out[world, place] = force
+    for k in range(trees):
+        observation_out[world, place + 1 + k] = wp.where(k == wanted, 1.0, 0.0)
+    effort = float(0.0)
+    for i in range(action.shape[1]):
+        effort = effort + action[world, i] * action[world, i]
+    reward = -numbers.distance_cost * wp.length(to_stalk) - numbers.force_cost * force - numbers.action_cost * effort
+    if since[world] == 1:
+        reward = reward + numbers.cut_reward
+    success = held[world] >= numbers.actions
+    if success:
+        reward = reward + numbers.success_reward
+    reward_out[world] = reward
+    success_out[world] = success
