@@ -148,7 +148,7 @@ def run_job(
     write_summary(out, summary)
     done = summary[done_key]
     console.print(f"{done_key} after {summary['seconds']:.1f} s" if done else f"not {done_key}: {summary['reason']}")
-    if job == "prune":
+    if job == "prune" and summary["detail"]["cuts_wanted"]:  # by sight only after the robot has looked around
         console.print(f"{summary['detail']['cuts_made']} of {summary['detail']['cuts_wanted']} cuts were made")
     if visitor is not None:
         sent = summary["told_visitor"]
