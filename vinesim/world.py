@@ -393,6 +393,11 @@ class Physics:
             self.dormant_bunches.restore_stalk(bunch)
             self._body_q = None
 
+    def apply_remote_passing(self, bunch: int, passed: tuple[int, ...]) -> None:
+        """Let a free bunch pass the trees that it passes on the client that moved it; see
+        :meth:`ContactSolver.pass_through`."""
+        self.contact_solver.pass_through(bunch, passed)
+
     def apply_remote_cut(self, body: int) -> None:
         """Cut off a piece of wood that another client has cut off; see :meth:`DetachmentMonitor.apply_remote_cut`."""
         self.detachment_monitor.apply_remote_cut(body)

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import json
+import pathlib
 import threading
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from tests.support.waiting import wait
 from vinesim.cli import client_session
-from vinesim.cli.client_session import ClientSession
+from vinesim.cli.client_session import ClientSession, save_report
+from vinesim.cli.demo.summary import LOOP_KEYS, job_summary
 from vinesim.net.server.server import Server
 from vinesim.plants.device_buffers import DeviceLost
 
@@ -59,3 +63,27 @@ def test_a_failure_beside_a_gpu_that_works_is_not_blamed_on_it(session, monkeypa
     with session._stack, pytest.raises(RuntimeError, match="error 700") as failure:
         session.run(CLIENT)
     assert not isinstance(failure.value, DeviceLost)
+
+
+def test_a_report_is_valid_json_whatever_its_numbers_are(tmp_path: pathlib.Path) -> None:
+    save_report(tmp_path, {"off": float("nan"), "peak": [np.float64("inf"), np.float64(1.5)], "count": np.int64(3)})
+    report = json.loads((tmp_path / "report.json").read_text(), parse_constant=pytest.fail)
+    assert report == {"off": None, "peak": [None, 1.5], "count": 3}
+
+
+@pytest.mark.parametrize(
+    ("is_stopped", "reason"),
+    [(True, "stopped at 'reach' before the end"), (False, "70 s were over at 'reach'; give more --seconds")],
+)
+def test_the_summary_of_a_task_says_whether_its_time_was_over(
+    tmp_path: pathlib.Path, is_stopped: bool, reason: str
+) -> None:
+    (tmp_path / "picker").mkdir()
+    job = {"succeeded": False, "reason": "", "phase": "reach"}
+    save_report(
+        tmp_path / "picker",
+        {"job": job, "time": 70.0, "bunches_picked": 0, "fruit": {}} | dict.fromkeys(LOOP_KEYS, 1.0),
+    )
+    given = {"scene": "winter_spur", "seed": 1, "robot": "vinebot", "no_ros": None, "with_visitor": False}
+    summary = job_summary(tmp_path, "prune", "pruned", **given, is_stopped=is_stopped)
+    assert (summary["pruned"], summary["reason"]) == (False, reason)

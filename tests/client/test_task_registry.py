@@ -67,6 +67,7 @@ def test_a_client_runs_the_pick_task():
     pick = task.pick
     assert pick is not None
     assert client.physics.rigid.free_bunches == (pick.plan.bunch,)
+    assert task.report()["others_off"] == 0, "the bunch in the hand"
     assert task.report()["phases_s"]["cut"] < 0.3  # the blades of vinebot close in 0.2 s
     run_to_the_end(client, task)
     assert task.report()["picked"] == task.report()["tried"] == 1

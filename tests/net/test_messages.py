@@ -536,6 +536,7 @@ def test_records_are_decoded_as_encoded():
     sent = [
         record(),
         record(stalk=(12, 345)),
+        record(passed=(ids.FIXED_PIECES, 0, 7)),
         record(wood=encode_wood(gave())),
         record(object=ids.object_id(ids.ObjectKind.TREE, 5), parent="", cut=(7, 9), trees=b"abc"),
     ]
@@ -572,6 +573,9 @@ def test_records_are_decoded_as_encoded():
         ({"wood": encode_wood(gave(places=(3, 3)))}, "does not increase"),
         ({"wood": encode_wood(gave(leaves=(4, 1)))}, "does not increase"),
         ({"fruit": (-1.0, 0.0)}, "impossible number of berries"),
+        ({"passed": (-2, 4)}, "impossible passed trees"),
+        ({"passed": (4, 4)}, "impossible passed trees"),
+        ({"passed": tuple(range(65))}, "impossible passed trees"),
         ({"parent": "x" * 201}, "impossible"),
     ],
 )

@@ -16,11 +16,12 @@ from vinesim.net.replication.receiver import check_record, check_tree_states
 from vinesim.net.transport.bus import KEEP_ALL
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.ids import ObjectKind, object_id
+from vinesim.scene.ids import FIXED_PIECES, ObjectKind, object_id
 from vinesim.scene.spec import load_scene
 
 TREE = 2
 BOX = object_id(ObjectKind.BOX, 0)
+BUNCH = object_id(ObjectKind.BUNCH, 0)
 COUNTS = (8, 4, 4)
 
 
@@ -54,6 +55,10 @@ LIES = {
     "another tree's state": record(trees=state_of(1)),
     "a box that is cut": record(object=BOX, cut=(1,)),
     "a box with a tree's state": record(object=BOX, trees=state_of(TREE)),
+    "a box that passes through a tree": record(object=BOX, passed=(1,)),
+    "a bunch that passes through a tree that there is not": record(
+        object=BUNCH, passed=(1, len(vineyard().tree_first))
+    ),
     "a box that lies in itself": record(object=BOX, parent="box/0"),
     "a parent that there is not": record(object=BOX, parent="box/99"),
     "a parent beyond all numbers": record(object=BOX, parent="box/" + "9" * 60),
@@ -71,6 +76,7 @@ def test_a_record_that_cannot_be_true_is_refused(lie: str) -> None:
     [
         record(),
         record(cut=(int(vineyard().tree_first[TREE]) + 3,), trees=state_of(TREE)),
+        record(object=BUNCH, passed=(FIXED_PIECES, 0, len(vineyard().tree_first) - 1)),
         record(object=BOX, parent="box/1"),
         record(object=BOX, parent="ada/gripper"),
     ],

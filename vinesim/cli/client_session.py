@@ -13,6 +13,8 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Self, TypeVar
 
+import msgspec
+
 from vinesim.avatar.tracked_human import TrackedHuman
 from vinesim.cli.client_options import ClientOptions, check_options
 from vinesim.cli.signals import stop_at_signals
@@ -229,10 +231,11 @@ def run_loop(
 
 
 def save_report(out: pathlib.Path, report: dict[str, Any]) -> None:
-    """Write ``report.json`` atomically."""
+    """Write ``report.json`` atomically. A number that is not finite becomes null, as JSON has none."""
     with writing(out / "report.json"):
         partial = out / "report.json.part"
-        partial.write_text(json.dumps(report, indent=2) + "\n")
+        plain = msgspec.json.encode(report, enc_hook=lambda number: number.item())  # numbers of NumPy
+        partial.write_bytes(msgspec.json.format(plain, indent=2) + b"\n")
         partial.replace(out / "report.json")
 
 

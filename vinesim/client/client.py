@@ -495,6 +495,7 @@ class Client:
                 stumps_of=objects.stumps_of,
                 wood_of=objects.wood_of,
                 fruit_of=objects.fruit_of,
+                passed_by=objects.passed_by,
             )
             for update in settled:
                 # All copies hold the quantised state of the last message, so this client takes it, too.
@@ -524,6 +525,7 @@ class Client:
                     stalk_of=self.objects.stalk_of,
                     wood_of=self.objects.wood_of,
                     fruit_of=self.objects.fruit_of,
+                    passed_by=self.objects.passed_by,
                 )
 
     def side_of(self, point: np.ndarray) -> str:

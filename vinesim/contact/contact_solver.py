@@ -20,7 +20,7 @@ from vinesim.contact.plant_capsules import HIDDEN, nearest_body, pass_leaves, pl
 from vinesim.kernels.contact import structs
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.rigid.rigid_world import RigidWorld
-from vinesim.scene.ids import Organ
+from vinesim.scene.ids import FIXED_PIECES, Organ
 from vinesim.scene.model import Model
 from vinesim.scene.values import Contact
 from vinesim.wires.deflected_wires import DeflectedWires
@@ -325,9 +325,22 @@ class ContactSolver:
         self.detection.remove_leaves(capsules[capsules >= 0])
 
     def ignore_overlaps(self, bunch: int, low: np.ndarray, high: np.ndarray) -> None:
-        """Disable contacts of a picked bunch with the trees that it overlaps; see
-        :meth:`ContactDetection.ignore_overlaps`."""
+        """Disable contacts of a picked bunch with the trees and fixed pieces that it overlaps; see
+        :meth:`ContactDetection.ignore_overlaps` and :meth:`RigidWorld.ignore_overlaps`."""
+        self.rigid.ignore_overlaps(bunch)
         self.detection.ignore_overlaps(bunch, low, high)
+
+    def passed_by(self, bunch: int) -> tuple[int, ...]:
+        """Returns the trees through which a free bunch passes since it was picked, sorted, and before them
+        :data:`FIXED_PIECES` if it passes through fixed pieces."""
+        fixed = (FIXED_PIECES,) if self.rigid.passes_fixed_pieces(bunch) else ()
+        return *fixed, *self.detection.passed_by(bunch).tolist()
+
+    def pass_through(self, bunch: int, passed: tuple[int, ...]) -> None:
+        """Let a free bunch pass through the trees and fixed pieces ``passed``, as :meth:`passed_by` returned them on
+        another client, while it overlaps them, and touch all others."""
+        self.rigid.pass_fixed_pieces(bunch, passing=FIXED_PIECES in passed)
+        self.detection.pass_through(bunch, np.array([tree for tree in passed if tree != FIXED_PIECES], int))
 
     def _update_rigid_world(self) -> None:
         """Read the rigid world again after an actor came or left, a hand opened or closed, or a bunch got a body."""

@@ -239,11 +239,20 @@ class ContactDetection:
         The bunch was picked within the box ``low`` [3] to ``high`` [3] m. While it hung there, its overlap with these
         trees was no contact.
         """
-        near = np.flatnonzero(((self.tree_boxes.low <= high) & (low <= self.tree_boxes.high)).all(1))
-        room = self._passing[near] < 0
-        near = near[room.any(1)]
+        self.pass_through(bunch, np.flatnonzero(((self.tree_boxes.low <= high) & (low <= self.tree_boxes.high)).all(1)))
+
+    def pass_through(self, bunch: int, trees: np.ndarray) -> None:
+        """Disable the contacts of a picked bunch with ``trees`` [k] until it no longer overlaps them, and enable its
+        contacts with all others."""
+        self._passing[self._passing == bunch] = -1
+        room = self._passing[trees] < 0
+        trees = trees[room.any(1)]
         room = room[room.any(1)]
-        self._passing[near, room.argmax(1)] = bunch
+        self._passing[trees, room.argmax(1)] = bunch
+
+    def passed_by(self, bunch: int) -> np.ndarray:
+        """Returns the trees [k] through which a picked bunch passes, sorted."""
+        return np.flatnonzero((self._passing == bunch).any(1))
 
     def find_reached_trees(self, awake: np.ndarray, among_plants: bool) -> np.ndarray:
         """Compute the boxes of the awake trees [k] over their predicted motion, and find the sleeping trees that the

@@ -559,7 +559,6 @@ class DetachmentMonitor:
         if place is not None:
             loose, velocity = self._take_stalk(bunch, loose, velocity, *place)
         self.rigid.add_bunch(bunch, loose, plants.state.body_q[body], velocity)
-        self.rigid.ignore_overlaps(bunch)
         self.contact_solver.ignore_overlaps(bunch, *_box_around(loose, plants.state.body_q[body].astype(float)))
         plants.state.bunch_attached[bunch] = False
         self.wood.forget(bunch)

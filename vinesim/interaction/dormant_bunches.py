@@ -35,6 +35,8 @@ class DormantBunches:
         self._bunches: dict[int, FreeBunch] = {}
         self._support: dict[int, str] = {}
         self._relative: dict[int, np.ndarray] = {}
+        self._passed: dict[int, tuple[int, ...]] = {}
+        """Trees that each bunch passes through; see :meth:`ContactSolver.pass_through`."""
         self._place: dict[int, np.ndarray] = {}
         """World pose [7] of each bunch, which is used while the bunch's support does not exist."""
         self._visuals: tuple[RigidVisual, ...] | None = ()
@@ -56,12 +58,20 @@ class DormantBunches:
     def __len__(self) -> int:
         return len(self._bunches)
 
-    def add(self, bunches: list[int], supports: list[str], poses: np.ndarray, places: np.ndarray | None = None) -> None:
+    def add(
+        self,
+        bunches: list[int],
+        supports: list[str],
+        poses: np.ndarray,
+        places: np.ndarray | None = None,
+        passed: list[tuple[int, ...]] | None = None,
+    ) -> None:
         """Add picked bunches, or move them.
 
         ``poses`` [k, 7]: poses in the frames of the ``supports`` (names). ``places`` [k, 7]: world poses while a
-        support does not exist; default ``poses``. Bunches that still hang are removed from their vines, which are not
-        woken.
+        support does not exist; default ``poses``. ``passed``: trees that each bunch passes through, as
+        :meth:`ContactSolver.passed_by` returns them; default none. Bunches that still hang are removed from their
+        vines, which are not woken.
         """
         plants = self.plants
         model = self.plants.model
@@ -89,6 +99,7 @@ class DormantBunches:
             self._support[bunch] = support
             self._relative[bunch] = np.asarray(pose, float)
             self._place[bunch] = np.asarray(place, float)
+        self._passed |= dict(zip(bunches, [()] * len(bunches) if passed is None else passed, strict=True))
         self._visuals = None
 
     def restore_stalk(self, bunch: int) -> None:
@@ -108,6 +119,7 @@ class DormantBunches:
             states = {bunch: self._world_state(bunch) for bunch in bunches}
             self.rigid.add_bunches({bunch: (self._bunches.pop(bunch), *states[bunch]) for bunch in bunches})
             for bunch in bunches:
+                self.contact_solver.pass_through(bunch, self._passed.pop(bunch))
                 del self._support[bunch], self._relative[bunch], self._place[bunch]
             self._visuals = None
 

@@ -722,6 +722,18 @@ class RigidWorld(MujocoWorld):
         self._passing_bunches.add(bunch)
         self._end_passing()
 
+    def passes_fixed_pieces(self, bunch: int) -> bool:
+        """Returns whether a free bunch passes through fixed pieces since it was picked."""
+        return bunch in self._passing_bunches
+
+    def pass_fixed_pieces(self, bunch: int, *, passing: bool) -> None:
+        """Let a free bunch pass through fixed pieces while it overlaps one, or collide with them."""
+        if passing:
+            self._passing_bunches.add(bunch)
+        else:
+            self._passing_bunches.discard(bunch)
+            self._set_passing({bunch}, False)
+
     def _end_passing(self) -> None:
         """Enable collisions with fixed pieces for the bunches that passed through a fixed piece since they were picked
         and no longer overlap any.

@@ -46,6 +46,9 @@ class ObjectKind(enum.IntEnum):
     BOX = 2
 
 
+FIXED_PIECES = -1
+"""Number of the fixed pieces (wood, wires, poles), all together, in lists of the trees that a bunch passes through."""
+
 OBJECT_STRIDE = 1 << 24
 """Factor of the kind in an object id, which is ``kind * OBJECT_STRIDE + index``. Ids of trees equal their indices."""
 

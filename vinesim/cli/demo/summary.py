@@ -205,11 +205,17 @@ def job_summary(
     robot: str,
     no_ros: str | None,
     with_visitor: bool,
+    is_stopped: bool,
 ) -> dict[str, Any]:
-    """Returns the measurements of a task. ``done_key``: name of the boolean that tells whether the task was done."""
+    """Returns the measurements of a task. ``done_key``: name of the boolean that tells whether the task was done;
+    ``is_stopped``: whether the user has stopped the demo."""
     report = report_of(out, PICKER)
     done = bool(report["job"]["succeeded"])
-    reason = report["job"]["reason"] or ("" if done else f"stopped at {report['job']['phase']!r} before the end")
+    reason = report["job"]["reason"]
+    if not done and not reason:
+        phase = report["job"]["phase"]
+        over = f"{report['time']:.0f} s were over at {phase!r}; give more --seconds"
+        reason = f"stopped at {phase!r} before the end" if is_stopped else over
     summary = {
         "scene": scene,
         "seed": seed,

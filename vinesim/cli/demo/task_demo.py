@@ -143,16 +143,18 @@ def run_job(
         robot=robot,
         no_ros=middleware.unavailable_reason(),
         with_visitor=visitor is not None,
+        is_stopped=is_stopped,
     )
     write_summary(out, summary)
     done = summary[done_key]
     console.print(f"{done_key} after {summary['seconds']:.1f} s" if done else f"not {done_key}: {summary['reason']}")
+    if job == "prune" and summary["detail"]["cuts_wanted"]:  # by sight only after the robot has looked around
+        console.print(f"{summary['detail']['cuts_made']} of {summary['detail']['cuts_wanted']} cuts were made")
     if visitor is not None:
         sent = summary["told_visitor"]
-        console.print(
-            f"{VISITOR} received {sum(sent['bytes'].values())} B of it, {sent['bytes_per_s']:.0f} B/s, and has "
-            f"{summary['visitor']['bunches_picked']} of {summary['bunches_picked']} bunches off their vines"
-        )
+        received = f"{VISITOR} received {sum(sent['bytes'].values())} B of it, {sent['bytes_per_s']:.0f} B/s"
+        off = f"{summary['visitor']['bunches_picked']} of {summary['bunches_picked']} bunches off their vines"
+        console.print(received if job == "prune" else f"{received}, and has {off}")
     console.print(f"pictures and summary.json are in {out}/")
     return INTERRUPTED if is_stopped else 0 if done else 5
 

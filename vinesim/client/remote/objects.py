@@ -128,6 +128,7 @@ class ObjectSync:
                 [record.parent for record in dormant],
                 np.array([record.pose for record in dormant]),
                 np.array([record.place or record.pose for record in dormant]),
+                [record.passed for record in dormant],
             )
 
     def _apply_object_record(self, record: RetainedRecord, holds: bool) -> bool:
@@ -147,6 +148,7 @@ class ObjectSync:
         self._set_resting(number, record)
         if not bodiless:
             self._place_on_support([number])
+            self._apply_passing(record)
         return bodiless
 
     def _let_fall(self, record: RetainedRecord, *, is_known: bool) -> None:
@@ -164,6 +166,13 @@ class ObjectSync:
         if not (had_body and is_known):
             tracker.set_state(number, pose, velocity)
         tracker.set_moving([number])
+        self._apply_passing(record)
+
+    def _apply_passing(self, record: RetainedRecord) -> None:
+        """Let a bunch with a body pass the trees that its record names."""
+        kind, bunch = split_object_id(record.object)
+        if kind == ObjectKind.BUNCH:
+            self.physics.apply_remote_passing(bunch, record.passed)
 
     def carrier_left(self, name: str) -> None:
         """Give bodies to the objects that rested on an actor that has left. They fall when the actor's copy is removed.
@@ -201,6 +210,11 @@ class ObjectSync:
         for bunches that were not handled."""
         kind, bunch = split_object_id(number)
         return self.physics.fruit_monitor.berries_off(bunch) if kind == ObjectKind.BUNCH else None
+
+    def passed_by(self, number: int) -> tuple[int, ...]:
+        """Returns the trees through which a bunch passes, as its record states them; none for other objects."""
+        kind, bunch = split_object_id(number)
+        return self.physics.contact_solver.passed_by(bunch) if kind == ObjectKind.BUNCH else ()
 
     def _apply_stalk(self, number: int, segment: int, steps: int) -> None:
         """Cut a bunch where its record names the cut, or give a bunch that was cut before its record came the stalk

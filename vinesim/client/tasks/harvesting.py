@@ -172,11 +172,12 @@ class Harvest(Task, abc.ABC):
             while not pick.is_done:
                 pick.control(self.time)
                 yield pick.phase
-                cut += self._bunches_cut()
+                now = self._bunches_cut()
+                self._cut += bool(now) and not cut
+                cut += now
             self.attempts.append(result := Attempt(plan.bunch, pick.picked, self.time - start, pick.reason))
             if pick.is_cut:  # otherwise a bunch that failed hangs on its vine and is tried again
                 tries[plan.bunch] = self.options.tries
-            self._cut += bool(cut)
             if pick.phase in BOX_PHASES:
                 yield from self._leave_box(pick)
             else:

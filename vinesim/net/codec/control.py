@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import math
 from typing import Any, NamedTuple
 
@@ -26,7 +27,7 @@ from vinesim.net.codec.trees import MAX_BODIES, MAX_TREES
 from vinesim.net.codec.wood import decode_wood
 from vinesim.net.pace import MIN_FACTOR, PaceReport
 from vinesim.net.replication.authority import Claim
-from vinesim.scene.ids import LABEL_STRIDE
+from vinesim.scene.ids import FIXED_PIECES, LABEL_STRIDE
 from vinesim.scene.robot_limits import MAX_JOINTS, urdf_objection
 from vinesim.scene.triangles import is_digest
 
@@ -40,6 +41,9 @@ DESCRIPTION = 22
 
 MAX_RECORDS = 4096
 """Largest number of retained records in one message."""
+
+MAX_PASSED = 64
+"""Largest number of trees through which a bunch passes by its record. The record names the first ones."""
 
 MAX_CAUSE = 120
 """Largest number of letters in the text that names what limits the real-time factor of a world."""
@@ -144,6 +148,9 @@ class RetainedRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknow
     """For a tree that has changed for good, besides cuts: encoded by :func:`vinesim.net.codec.wood.encode_wood`."""
     fruit: tuple[float, float] | None = None
     """For a bunch that was handled: expected numbers of its berries that burst and that were lost."""
+    passed: tuple[int, ...] = ()
+    """For a bunch that was picked where it overlapped plants, and has overlapped them since: the trees through which it
+    passes, in increasing order, before them :data:`vinesim.scene.ids.FIXED_PIECES`; at most :data:`MAX_PASSED`."""
 
     @property
     def claim(self) -> Claim:
@@ -325,7 +332,14 @@ def decode_records(payload: bytes, counts: tuple[int, ...] | None = None) -> lis
             decode_wood(record.wood)
         if record.fruit is not None and not all(0.0 <= number < 1e5 for number in record.fruit):
             raise MessageError(f"record of object {record.object} with an impossible number of berries {record.fruit}")
+        if len(record.passed) > MAX_PASSED or not _increases((FIXED_PIECES - 1, *record.passed)):
+            raise MessageError(f"record of object {record.object} with impossible passed trees {record.passed[:4]}")
     return records
+
+
+def _increases(numbers: tuple[int, ...]) -> bool:
+    """Returns whether each number is greater than the one before it."""
+    return all(one < two for one, two in itertools.pairwise(numbers))
 
 
 class ClockMessage(NamedTuple):

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import struct
 
-PROTOCOL = 10
+PROTOCOL = 11
 """Version of the wire format. Messages of any other version are refused."""
 
 MAGIC = b"VS"

@@ -29,7 +29,7 @@ from vinesim.net.replication.authority import NO_OWNER, Claim
 from vinesim.net.replication.interest import Cell
 from vinesim.net.replication.replication_state import SPECTATOR, ReplicationState, put_counted
 from vinesim.net.transport.bus import Reply
-from vinesim.scene.ids import Organ, is_tree, parse_object_name
+from vinesim.scene.ids import ObjectKind, Organ, is_tree, parse_object_name, split_object_id
 from vinesim.scene.model import Model
 from vinesim.scene.spare_bodies import PLACE_STEP
 from vinesim.scene.values import GivenWood, HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpdate
@@ -339,6 +339,11 @@ def check_record(record: RetainedRecord, model: Model, counts: tuple[int, ...]) 
         _check_tree_record(record, model)
     elif record.cut or record.trees or record.stumps or record.wood:
         raise MessageError(f"record of object {record.object} with cuts or the state of a tree; it is none")
+    if record.passed and split_object_id(record.object)[0] != ObjectKind.BUNCH:
+        raise MessageError(f"record of object {record.object} that passes through trees; it is no bunch")
+    for tree in record.passed[-1:]:
+        if tree >= len(model.tree_first):
+            raise MessageError(f"record of object {record.object} that passes through tree {tree}; there is none")
     parent = parse_object_name(record.parent)
     if parent is not None:
         check_object_id(parent, counts)

@@ -243,6 +243,7 @@ class Replicator:
         stumps_of: Callable[[int], tuple[tuple[int, int, int], ...]] = lambda _: (),
         wood_of: Callable[[int], bytes] = lambda _: b"",
         fruit_of: Callable[[int], tuple[float, float] | None] = lambda _: None,
+        passed_by: Callable[[int], tuple[int, ...]] = lambda _: (),
     ) -> list[TreeUpdate]:
         """Publish the results of one step. Returns the states of trees at rest that were sent, as all receivers decode
         them.
@@ -271,6 +272,8 @@ class Replicator:
           (:attr:`vinesim.net.codec.control.RetainedRecord.wood`).
         * ``fruit_of(object_id)``: the berries that a bunch has lost
           (:attr:`vinesim.net.codec.control.RetainedRecord.fruit`).
+        * ``passed_by(object_id)``: the trees through which a bunch passes
+          (:attr:`vinesim.net.codec.control.RetainedRecord.passed`).
         """
         state = self._state
         self._follow_clock()
@@ -302,6 +305,7 @@ class Replicator:
                 stumps_of,
                 wood_of,
                 fruit_of,
+                passed_by,
             )
         )
 

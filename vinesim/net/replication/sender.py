@@ -13,7 +13,7 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 
-from vinesim.net.codec.control import RetainedRecord, encode_claims
+from vinesim.net.codec.control import MAX_PASSED, RetainedRecord, encode_claims
 from vinesim.net.codec.header import LARGEST_COORDINATE
 from vinesim.net.codec.trees import RESTING, TOUCHED, TreeStates, encode_trees
 from vinesim.net.replication import authority, dead_reckoning
@@ -61,6 +61,7 @@ class LocalStep:
     stumps_of: Callable[[int], tuple[tuple[int, int, int], ...]]
     wood_of: Callable[[int], bytes]
     fruit_of: Callable[[int], tuple[float, float] | None]
+    passed_by: Callable[[int], tuple[int, ...]]
 
 
 class Sender:
@@ -326,7 +327,7 @@ class Sender:
         record = RetainedRecord(
             object_id, claim.ownership, claim.authority, state.hello.name, _within_range(pose), parent
         )
-        record = msgspec.structs.replace(record, stalk=step.stalk_of(object_id), fruit=step.fruit_of(object_id))
+        record = _with_properties(record, step)
         if parent and parse_object_name(parent) is None:
             record = msgspec.structs.replace(record, place=_within_range(step.read(object_id)[0]))
         state.retained.publish(state.object_stream.cells((object_id,))[0], record)
@@ -344,9 +345,7 @@ class Sender:
             return
         state.object_stream.positions((object_id,), step.read)
         pose, _ = step.read(object_id)
-        record = msgspec.structs.replace(
-            record, pose=_within_range(pose), stalk=step.stalk_of(object_id), fruit=step.fruit_of(object_id)
-        )
+        record = _with_properties(msgspec.structs.replace(record, pose=_within_range(pose)), step)
         state.retained.publish(state.object_stream.cells((object_id,))[0], record)
 
     def _publish_tree_record(self, cell: Cell, record: RetainedRecord, step: LocalStep) -> None:
@@ -385,6 +384,14 @@ def _columns(objects: list[tuple[int, ObjectRecord]]) -> ClaimColumns:
     """Returns the claims and flags of objects for a message."""
     entries = [entry for _, entry in objects]
     return ClaimColumns([entry.claim for entry in entries], [TOUCHED * entry.touching for entry in entries])
+
+
+def _with_properties(record: RetainedRecord, step: LocalStep) -> RetainedRecord:
+    """Returns the record of a box or a bunch with what only bunches have: stalk, lost berries, and trees that it
+    passes."""
+    number = record.object
+    passed = step.passed_by(number)[:MAX_PASSED]
+    return msgspec.structs.replace(record, stalk=step.stalk_of(number), fruit=step.fruit_of(number), passed=passed)
 
 
 def _within_range(pose: np.ndarray) -> tuple[float, float, float, float, float, float, float]:
