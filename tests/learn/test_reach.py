@@ -97,7 +97,7 @@ def test_a_world_that_explodes_ends_with_its_fault_and_the_others_do_not_notice(
             assert np.isfinite(b).all()
     _, reward, terminated, truncated, fault = broken[2]
     assert fault[1] & 1
-    assert reward[1] == 0.0
+    assert reward[1] == -10.0
     assert terminated.tolist() == [False, True, False]
     assert not truncated.any()
     assert not broken[3][4].any(), "the world has begun again"

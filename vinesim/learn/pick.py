@@ -25,6 +25,8 @@ FINGER_SPEED = 0.15
 REACH = 0.05
 """[m] Distance of the stalk from the point between the fingers up to which the bunch is in the hand. GUESSED: the
 fingers are 8 cm long."""
+LOST = 0.2
+"""[m] Distance of the stalk from which on a bunch that came off is lost. GUESSED."""
 SPEED = 0.1
 """[m/s] Speed below which the bunch is held, not falling or swinging. GUESSED."""
 HELD = 5
@@ -48,8 +50,9 @@ class PickEnv(ArmEnv):
     Reward of an action: 2 for the action with which the wanted bunch comes off, 10 at success, minus the distance of
     its stalk from the point between the fingers [m], minus 0.02 for each newton on the other shoot, minus 0.01 for each
     unit of squared action. Success: the bunch has been held for 0.2 s: it is off the vine, its stalk is less than 5 cm
-    from the point between the fingers, and its middle moves by less than 0.1 m/s. An episode ends at success, and is
-    truncated after 150 actions (6 s).
+    from the point between the fingers, and its middle moves by less than 0.1 m/s. An episode ends at success. It ends
+    with a reward lower by 2 if the wanted bunch is lost (off the vine, its stalk farther than 20 cm from that point)
+    or the other one comes off. It is truncated after 150 actions (6 s).
 
     ``options``: arguments of :class:`~vinesim.learn.arm_env.ArmEnv`.
     """
@@ -89,7 +92,7 @@ class PickEnv(ArmEnv):
 
     def _judgements(self, results: Any) -> list[KernelLaunch]:
         given = [self._numbers(), self.num_envs, self.arm_arrays.arm, self._places(), self._target]
-        count = KernelLaunch(kernels.count_held, given, [self._held, self._since], threads=self.num_envs)
+        count = KernelLaunch(kernels.count_held, given, [self._held, self._since, self._failed], threads=self.num_envs)
         return [count, *super()._judgements(results)]
 
     def _observations(self, observation: wp.array, reward: wp.array, success: wp.array) -> list[KernelLaunch]:
@@ -111,7 +114,7 @@ class PickEnv(ArmEnv):
 
     def _numbers(self) -> kernels.PickNumbers:
         numbers = kernels.PickNumbers()
-        numbers.reach, numbers.speed, numbers.actions = REACH, SPEED, HELD
+        numbers.reach, numbers.lost, numbers.speed, numbers.actions = REACH, LOST, SPEED, HELD
         numbers.cut_reward, numbers.success_reward = 2.0, 10.0
         numbers.distance_cost, numbers.force_cost, numbers.action_cost = 1.0, 0.02, 0.01
         return numbers

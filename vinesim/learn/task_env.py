@@ -48,7 +48,7 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
     ``info`` of an action has ``success`` bool [world], ``fault`` int32 [world] (see
     :attr:`vinesim.worlds.worlds.Worlds.faults`), and if worlds ended also ``final_obs`` [world, k], their last
     observations, with ``_final_obs`` bool [world], which worlds ended. These worlds begin again in the same step. A
-    world with a fault is terminated with reward 0.
+    world with a fault is terminated with reward -10.
 
     With arrays on the device, nothing is copied to the host. Results of an action are overwritten by the action after
     the next one, and ``final_obs`` is always present.
@@ -105,6 +105,8 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         """[world] Number of actions of the episode so far, on the device."""
         self._episode = self.empty(wp.int32)
         self._begins = self.empty(wp.bool)
+        self._failed = self.empty(wp.bool)
+        """[world] Whether success is no longer possible, so that the episode ends. Judgements may write it."""
         unused = (self.empty(float), self.empty(wp.bool))
         each = {"threads": self.num_envs, "width": actions}
         delay = KernelLaunch(delay_actions, [self._delay, self._given_action], [self._history, self._action], **each)
@@ -150,7 +152,7 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
 
     def _judgements(self, results: _Results) -> list[KernelLaunch]:
         _, last, reward, success, *flags = results
-        given = [self.max_episode_steps, self.worlds.faults]
+        given = [self.max_episode_steps, self.worlds.faults, self._failed]
         written = [self.elapsed, last, reward, success, *flags]
         return [
             *self._observations(last, reward, success),

@@ -4,6 +4,13 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
+FAULT_REWARD = wp.constant(-10.0)
+"""Reward of an action with a fault. GUESSED: less than the costs of a bad episode would let a policy seek faults."""
+
+FAILURE_REWARD = wp.constant(-2.0)
+"""Added to the reward of an action after which success is no longer possible. GUESSED: the end of an episode, which
+spares its further costs, is no gain then."""
+
 
 @wp.kernel
 def end_episodes(
@@ -11,6 +18,7 @@ def end_episodes(
     max_steps: int,
     # in
     faults: wp.array(dtype=wp.int32),
+    failed: wp.array(dtype=wp.bool),
     # out
     elapsed_out: wp.array(dtype=wp.int32),
     observation_out: wp.array2d(dtype=float),
@@ -23,19 +31,22 @@ def end_episodes(
 ):
     """One thread per world, after an action. Decide whether the world's episode ends.
 
-    A world with a fault ends without success and with reward 0; its observation gets 0 for numbers that are not finite.
-    elapsed: [world] number of actions of the episode. fault: [world] copy of ``faults``.
+    A world with a fault ends without success and with :data:`FAULT_REWARD`; its observation gets 0 for numbers that are
+    not finite. failed: [world] whether success is no longer possible. elapsed: [world] number of actions of the episode.
+    fault: [world] copy of ``faults``.
     """
     world = wp.tid()
     fault = faults[world]
     for k in range(observation_out.shape[1]):
         if not wp.isfinite(observation_out[world, k]):
             observation_out[world, k] = 0.0
+    if failed[world]:
+        reward_out[world] = reward_out[world] + FAILURE_REWARD
     if fault != 0:
-        reward_out[world] = 0.0
+        reward_out[world] = FAULT_REWARD
         success_out[world] = False
     elapsed = elapsed_out[world] + 1
-    terminated = success_out[world] or fault != 0
+    terminated = success_out[world] or failed[world] or fault != 0
     truncated = elapsed >= max_steps and not terminated
     ended = terminated or truncated
     if ended:

@@ -16,6 +16,8 @@ class PickNumbers:
 
     reach: float
     """[m] Distance of the stalk from the point between the fingers up to which the bunch is in the hand."""
+    lost: float
+    """[m] Distance of the stalk from which on a bunch that came off is lost."""
     speed: float
     """[m/s] Speed of the bunch's middle below which it is held."""
     actions: int
@@ -124,14 +126,20 @@ def count_held(
     # out
     held_out: wp.array(dtype=wp.int32),
     since_out: wp.array(dtype=wp.int32),
+    failed_out: wp.array(dtype=wp.bool),
 ):
     """One thread per world, once after each action. Count the actions since the wanted bunch has been off its vine
-    (``since`` [world]), and for how many of the last ones it has been held (``held`` [world])."""
+    (``since`` [world]), and for how many of the last ones it has been held (``held`` [world]). The task has failed
+    (``failed`` [world]) if the wanted bunch is lost, or another one is off its vine."""
     world = wp.tid()
     tree = target[world] * worlds + world
     slot = slot_of(world, tree, bunches)
     held = int(0)
     since = int(0)
+    failed = bool(False)
+    for other in range(bunches.body.shape[0] / worlds):
+        if other != target[world] and slot_of(world, other * worlds + world, bunches) >= 0:
+            failed = True
     if slot >= 0:
         since = since_out[world] + 1
         body = bunches.free_body[wp.max(slot, 0)]
@@ -143,8 +151,11 @@ def count_held(
         away = stalk_point(world, tree, slot, bunches) - point
         if wp.length(away) < numbers.reach and wp.length(velocity) < numbers.speed:
             held = held_out[world] + 1
+        if wp.length(away) > numbers.lost:
+            failed = True
     held_out[world] = held
     since_out[world] = since
+    failed_out[world] = failed
 
 
 @wp.kernel
