@@ -19,8 +19,9 @@ from vinesim.net.codec.messages import FAMILIES, sender_of
 MAX_FORMER_SESSIONS = 8
 """Largest number of sessions that have left and are still stored, for one name."""
 
-MAX_FORMER_NAMES = 256
-"""Largest number of names without a live session that are still stored."""
+MAX_FORMER_NAMES = 4096
+"""Largest number of names without a live session that are still stored. When a connection is lost, all names behind it
+lose their sessions at once, and messages may come back before the tokens do: more than a world has actors."""
 
 BOUND_FAMILIES = frozenset(name for name, family in FAMILIES.items() if family.is_published) | {"hello", "robot"}
 """Families of keys that contain the name of the actor that may send under them, by their first chunk."""
