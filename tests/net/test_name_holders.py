@@ -218,6 +218,9 @@ def test_a_thousand_names_keep_their_holders_while_the_connection_is_lost():
     names.refresh([])
     assert names.live == frozenset()
     assert [names.holder(name) for name, _ in tokens] == [session for _, session in tokens]
+    assert names.returned == 0
+    names.refresh(tokens)
+    assert names.returned == 1000
 
 
 @given(st.lists(st.tuples(st.sampled_from("123"), st.booleans()), max_size=30))

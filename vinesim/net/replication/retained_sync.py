@@ -3,8 +3,9 @@
 A record is published once, wherever the peers are, because the server keeps it for others. Records of peers arrive by
 subscription, and earlier records of a cell by a query to the server. When the connection to the server was lost and is
 back, the actor publishes all its own records again, because the server may be a new one without records, and queries
-all cells again. It also queries them after it has missed messages, like those of a session that did not seem to hold
-its name. So a starved machine or network delays records and loses none.
+all cells again. It also does so some time after signs that messages were lost on their way, like a message of a session
+that did not seem to hold its name, or a connection between others that was lost. So a machine that is overloaded delays
+records and loses none.
 """
 
 from __future__ import annotations
@@ -26,8 +27,11 @@ MAX_QUERY_PERIOD = 8.0
 """Longest time between two repetitions of a query without a reply [s]."""
 
 REPAIR_DELAY = 8.0
-"""Time from a missed message until the cells are queried again [s]. By then the server has what the message said, even
-if its sender had to join again. GUESSED."""
+"""Time from a sign of lost messages until records are exchanged again [s]. By then the server has what the messages
+said, even if their sender had to join again. GUESSED."""
+
+REPAIR_PERIOD = 30.0
+"""Shortest time between two such exchanges [s], whatever others send. GUESSED."""
 
 TYPICAL_RECORD_SIZE = 110
 """Upper estimate of the size of an encoded record without the state of a tree [B]."""
@@ -49,9 +53,10 @@ class RetainedSync:
         self._admissions = 0
         """Number of admissions of this actor when the records were last published and queried for a new connection."""
         self._missed = 0
-        """Number of missed messages for which the cells were queried again or will be."""
+        """Number of signs of lost messages after which records were exchanged again or will be."""
         self._repair_due = math.inf
-        """Time at which the cells are queried again because messages were missed [s]."""
+        """Time at which records are exchanged again because messages may be lost [s]."""
+        self._repaired_at = -math.inf
         self._window_changes = -1
         self._next_query = math.inf
         """Time at which the next query to the server is due [s]."""
@@ -82,7 +87,7 @@ class RetainedSync:
         """Subscribe to the records of the cells in ``window``, and query the server for the records of new cells.
 
         ``changes``: number of changes of the window so far. ``now``: own time [s]. Returns at once if neither the
-        window nor the connection to the server has changed, no message was missed and no query is due.
+        window nor the connection to the server has changed, no message may be lost and no query is due.
         """
         is_disconnected = bool(self.bus.status_message)
         # a loop that gets no processor time may not see that the connection is lost, but the server admits it again
@@ -99,16 +104,16 @@ class RetainedSync:
         wanted = set(window)
         self._window_changes = changes
         is_new_connection = admissions != self._admissions or (self._is_disconnected and not is_disconnected)
-        if is_new_connection:
+        is_repair = now >= self._repair_due and not is_disconnected
+        if is_repair:
+            self._repair_due = math.inf
+            self._repaired_at = now
+        if is_new_connection or is_repair:
             for object_id, (cell, record) in self._authored.items():
                 self._pending.setdefault(cell, {})[object_id] = record
-        is_repair = now >= self._repair_due and not is_disconnected
-        if is_new_connection or is_repair:
             self._asked = dict.fromkeys(wanted, (now, QUERY_TIMEOUT))
         self._admissions = admissions
         self._is_disconnected = is_disconnected
-        if is_repair:
-            self._repair_due = math.inf
         if self._repair_due == math.inf and self.bus.missed != self._missed:
             self._missed = self.bus.missed
             self.repair(now)
@@ -131,8 +136,9 @@ class RetainedSync:
         self._next_query = min(self._next_query, self._repair_due)
 
     def repair(self, now: float) -> None:
-        """Query all cells again after :data:`REPAIR_DELAY`, because a message was missed at own time ``now`` [s]."""
-        self._repair_due = min(self._repair_due, now + REPAIR_DELAY)
+        """Exchange all records again after :data:`REPAIR_DELAY`, because a message was lost at own time ``now`` [s]."""
+        if self._repair_due == math.inf:
+            self._repair_due = max(now + REPAIR_DELAY, self._repaired_at + REPAIR_PERIOD)
         self._next_query = min(self._next_query, self._repair_due)
 
     def mark_answered(self, cell: Cell) -> None:

@@ -115,8 +115,9 @@ class Bus(Protocol):
 
     @property
     def missed(self) -> int:
-        """Number of samples of subscriptions with the depth ``KEEP_ALL`` that were discarded for any reason. Whoever
-        needs what they said has to ask for it."""
+        """Number of signs that reliable samples did not arrive: samples of subscriptions with the depth ``KEEP_ALL``
+        that were discarded for any reason, and names that were not live for a while, because a connection between
+        others was lost."""
         ...
 
     failures: int

@@ -53,6 +53,8 @@ class NameHolders:
         self._lock = threading.Lock()
         self.live = own
         """Names that have a live session, and the own names."""
+        self.returned = 0
+        """Number of times that a name without a live session got one again: the connection to it was lost."""
 
     def start(self, tokens: list[tuple[str, str]]) -> None:
         """Store all tokens, as (name, session), that existed before this member joined."""
@@ -78,7 +80,9 @@ class NameHolders:
                 del sessions[one]
             self._choose(name)
             if any(sessions.values()):
-                self._departed.pop(name, None)
+                if name in self._departed:
+                    del self._departed[name]
+                    self.returned += 1
                 if name not in self.live:
                     self.live |= {name}
                 return

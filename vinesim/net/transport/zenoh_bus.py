@@ -491,7 +491,7 @@ class ZenohBus:
 
     @property
     def missed(self) -> int:
-        return self._missed + self._store.missed
+        return self._missed + self._store.missed + self._names.returned
 
     @property
     def status_message(self) -> str:
