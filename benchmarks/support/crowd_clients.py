@@ -123,6 +123,8 @@ class Worker:
             "placed": len(client.replicator.peer_positions()),
             "owned": len(client.replicator.owned),
             "records": records,
+            "missed": client.replicator.bus.missed,
+            "admissions": client.replicator.bus.admissions,
             "faults": {name: value for name, value in client.physics.faults.items() if value},
         }
 
