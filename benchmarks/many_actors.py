@@ -40,7 +40,8 @@ from benchmarks.support.indexed_hub import IndexedHub
 from vinesim.client.client import Client, label_index
 from vinesim.core import frames
 from vinesim.net.codec.control import decode_records, decode_time, encode_records, encode_time
-from vinesim.net.replication import interest
+from vinesim.net.replication import authority, interest
+from vinesim.net.replication.authority import Claim
 from vinesim.net.replication.retained import RetainedState
 from vinesim.net.transport.bus import KEEP_ALL
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -292,6 +293,8 @@ WORKING_LIMIT = 20.0
 """Limit of simulated time [s] until everything is at rest by equal records."""
 POLL = 1.0
 """Real time between two reports of all clients [s]."""
+SHOWN = 3
+"""Number of objects whose different records are shown."""
 NEWS_PERIOD = 10.0
 """Real time between two lines that tell how far the clients are [s]."""
 
@@ -309,14 +312,35 @@ def _clients(answers: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _are_equal(reports: list[dict[str, Any]]) -> tuple[int, int, bool]:
-    """Returns the number of objects with a record, the number of those whose records are at rest and equal on all
-    clients that have one, and whether nothing has an owner any more."""
-    found: dict[str, set[tuple[str, bool]]] = {}
-    for report in reports:
-        for name, record in report["records"].items():
-            found.setdefault(name, set()).add(tuple(record))
-    equal = sum(len(records) == 1 and not next(iter(records))[1] for records in found.values())
-    return len(found), equal, not any(report["owned"] for report in reports)
+    """Returns the number of objects with a record, the number of those that :func:`_unequal` does not name, and whether
+    nothing has an owner any more."""
+    objects = {name for report in reports for name in report["records"]}
+    return len(objects), len(objects) - len(_unequal(reports)), not any(report["owned"] for report in reports)
+
+
+def _unequal(reports: list[dict[str, Any]]) -> dict[str, str]:
+    """Returns, by object, in words what is wrong: the record with the greatest claim is of a moving object, or a client
+    that receives the records of its cell has another one or none.
+
+    Other clients may have a former record, for example because they owned the object while its neighbours seemed to be
+    gone. They receive the valid one when they come near.
+    """
+    found: dict[str, str] = {}
+    for name in {name for report in reports for name in report["records"]}:
+        held = {report["number"]: report["records"][name] for report in reports if name in report["records"]}
+        best = next(iter(held.values()))
+        for record in held.values():
+            if authority.wins(Claim(*record[2]), Claim(*best[2])):
+                best = record
+        others = [
+            report["number"]
+            for report in reports
+            if best[3] in report["window"] and report["records"].get(name, [""])[0] != best[0]
+        ]
+        if best[1] or others:
+            state = "moving" if best[1] else "at rest"
+            found[name] = f"{state} by the record of {best[2][2]} with claim {best[2][:2]}, not on clients {others}"
+    return found
 
 
 def _how_far(reports: list[dict[str, Any]], wanted: np.ndarray) -> str:
@@ -327,11 +351,11 @@ def _how_far(reports: list[dict[str, Any]], wanted: np.ndarray) -> str:
         f"{sum(one['known'] == others for one in reports)} of {others + 1} clients know all others, "
         f"{sum(one['placed'] == others for one in reports)} know where they are, "
         f"{sum(one['bodies'] >= enough for one, enough in zip(reports, wanted.tolist(), strict=True))} have the bodies "
-        f"of those around; {objects} objects have a record, {equal} of them the same one at rest on all clients that "
-        f"have one, {sum(one['owned'] for one in reports)} have an owner; world time "
+        f"of those around; {objects} objects have a record, {equal} of them the same one at rest on all clients "
+        f"around, {sum(one['owned'] for one in reports)} have an owner; world time "
         f"{min(one['time'] for one in reports):.2f} to {max(one['time'] for one in reports):.2f} s; "
         f"{sum(one['admissions'] for one in reports)} admissions, {sum(one['missed'] for one in reports)} signs of "
-        "lost messages"
+        f"lost messages{''.join(f'; {name}: {held}' for name, held in list(_unequal(reports).items())[:SHOWN])}"
     )
 
 
@@ -416,7 +440,7 @@ def whole_clients(
         ("routers' CPU, per simulated second", router_time / simulated, "s"),
         ("real-time factor", simulated / wall, ""),
         ("objects with a record", objects, "objects"),
-        ("of these at rest by the same record on all clients that have one", equal, "objects"),
+        ("of these at rest by the same record on all clients around", equal, "objects"),
         ("signs of lost messages, all clients", sum(one["missed"] for one in reports), ""),
         ("admissions by the server", sum(one["admissions"] for one in reports), ""),
         ("faults of all clients", sum(sum(one["faults"].values()) for one in reports), "faults"),

@@ -104,5 +104,6 @@ def test_a_record_of_a_session_that_did_not_seem_to_hold_its_name_arrives_later(
             news.setattr(bobs._names, "holder", lambda name: "")
             ada.publish(2)
             wait(running([ada, bob], lambda: bobs.foreign), "bob to drop it")
+        assert bobs.missed == 1
         assert not bob.has(2)
         wait(running([ada, bob], lambda: bob.has(2)), "the record", 20.0)

@@ -135,6 +135,11 @@ class RetainedSync:
         self._next_query = min((due for due, _ in self._asked.values()), default=math.inf)
         self._next_query = min(self._next_query, self._repair_due)
 
+    @property
+    def window(self) -> frozenset[Cell]:
+        """Cells whose records this actor receives now. Of other cells it may know records that are no longer valid."""
+        return frozenset(self._subscriptions)
+
     def repair(self, now: float) -> None:
         """Exchange all records again after :data:`REPAIR_DELAY`, because a message was lost at own time ``now`` [s]."""
         if self._repair_due == math.inf:
