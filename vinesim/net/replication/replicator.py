@@ -20,10 +20,10 @@ from vinesim.net.codec.control import Description, Hello, RetainedRecord
 from vinesim.net.codec.messages import MESSAGES, Counters
 from vinesim.net.pace import PaceReport
 from vinesim.net.replication import interest
-from vinesim.net.replication.interest import Cell
 from vinesim.net.replication.authority import Claim
 from vinesim.net.replication.clock_sync import STEP_THRESHOLD
 from vinesim.net.replication.direct_messages import HAND_FORCE, LinkCentre
+from vinesim.net.replication.interest import Cell
 from vinesim.net.replication.receiver import Inbox, Receiver
 from vinesim.net.replication.replication_state import ReplicationState
 from vinesim.net.replication.sender import LocalStep, Sender
