@@ -115,7 +115,9 @@ def _many_actors(
         raise UsageError(f"--simulated is {simulated!r}: give numbers with commas between them") from None
     if any(count < 2 for count in counts):
         raise UsageError(f"--simulated is {simulated!r}: give numbers of 2 or more")
-    return _call("many_actors:many_actors")(clients, apart, seconds, processes, real_time_factor, limit, counts)
+    return _call("many_actors:many_actors")(
+        clients, apart, seconds, processes, real_time_factor, limit, counts, announce
+    )
 
 
 def _soak(

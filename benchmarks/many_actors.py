@@ -40,7 +40,8 @@ from benchmarks.support.indexed_hub import IndexedHub
 from vinesim.client.client import Client, label_index
 from vinesim.core import frames
 from vinesim.net.codec.control import decode_records, decode_time, encode_records, encode_time
-from vinesim.net.replication import interest
+from vinesim.net.replication import authority, interest
+from vinesim.net.replication.authority import Claim
 from vinesim.net.replication.retained import RetainedState
 from vinesim.net.transport.bus import KEEP_ALL
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -292,13 +293,18 @@ WORKING_LIMIT = 20.0
 """Limit of simulated time [s] until everything is at rest by equal records."""
 POLL = 1.0
 """Real time between two reports of all clients [s]."""
+SHOWN = 3
+"""Number of objects whose different records are shown."""
+NEWS_PERIOD = 10.0
+"""Real time between two lines that tell how far the clients are [s]."""
 
 
-def _ask(processes: list[CrowdProcess], do: str = "report") -> list[dict[str, Any]]:
-    """Send a command to all processes, and return their answers."""
+def _ask(processes: list[CrowdProcess], end: float, do: str = "report") -> list[dict[str, Any]]:
+    """Send a command to all processes, and return their answers. Raises RuntimeError if one does not answer until the
+    time ``end`` [s] of the monotonic clock."""
     for process in processes:
         process.send(do=do)
-    return [process.answer() for process in processes]
+    return [process.answer(max(end - time.monotonic(), POLL)) for process in processes]
 
 
 def _clients(answers: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -306,24 +312,68 @@ def _clients(answers: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _are_equal(reports: list[dict[str, Any]]) -> tuple[int, int, bool]:
-    """Returns the number of objects with a record, the number of those whose records are at rest and equal on all
-    clients that have one, and whether nothing has an owner any more."""
-    found: dict[str, set[tuple[str, bool]]] = {}
-    for report in reports:
-        for name, record in report["records"].items():
-            found.setdefault(name, set()).add(tuple(record))
-    equal = sum(len(records) == 1 and not next(iter(records))[1] for records in found.values())
-    return len(found), equal, not any(report["owned"] for report in reports)
+    """Returns the number of objects with a record, the number of those that :func:`_unequal` does not name, and whether
+    nothing has an owner any more."""
+    objects = {name for report in reports for name in report["records"]}
+    return len(objects), len(objects) - len(_unequal(reports)), not any(report["owned"] for report in reports)
+
+
+def _unequal(reports: list[dict[str, Any]]) -> dict[str, str]:
+    """Returns, by object, in words what is wrong: the record with the greatest claim is of a moving object, or a client
+    that receives the records of its cell has another one or none.
+
+    Other clients may have a former record, for example because they owned the object while its neighbours seemed to be
+    gone. They receive the valid one when they come near.
+    """
+    found: dict[str, str] = {}
+    for name in {name for report in reports for name in report["records"]}:
+        held = {report["number"]: report["records"][name] for report in reports if name in report["records"]}
+        best = next(iter(held.values()))
+        for record in held.values():
+            if authority.wins(Claim(*record[2]), Claim(*best[2])):
+                best = record
+        others = [
+            report["number"]
+            for report in reports
+            if best[3] in report["window"] and report["records"].get(name, [""])[0] != best[0]
+        ]
+        if best[1] or others:
+            state = "moving" if best[1] else "at rest"
+            found[name] = f"{state} by the record of {best[2][2]} with claim {best[2][:2]}, not on clients {others}"
+    return found
+
+
+def _how_far(reports: list[dict[str, Any]], wanted: np.ndarray) -> str:
+    """Returns in words how far the clients are. ``wanted``: number of bodies that each client should have."""
+    others = len(reports) - 1
+    objects, equal, _ = _are_equal(reports)
+    return (
+        f"{sum(one['known'] == others for one in reports)} of {others + 1} clients know all others, "
+        f"{sum(one['placed'] == others for one in reports)} know where they are, "
+        f"{sum(one['bodies'] >= enough for one, enough in zip(reports, wanted.tolist(), strict=True))} have the bodies "
+        f"of those around; {objects} objects have a record, {equal} of them the same one at rest on all clients "
+        f"around, {sum(one['owned'] for one in reports)} have an owner; world time "
+        f"{min(one['time'] for one in reports):.2f} to {max(one['time'] for one in reports):.2f} s; "
+        f"{sum(one['admissions'] for one in reports)} admissions, {sum(one['missed'] for one in reports)} signs of "
+        f"lost messages{''.join(f'; {name}: {held}' for name, held in list(_unequal(reports).items())[:SHOWN])}"
+    )
 
 
 def whole_clients(
-    count: int, apart: float, seconds: float, processes: int, factor: float | None, limit: float
+    count: int,
+    apart: float,
+    seconds: float,
+    processes: int,
+    factor: float | None,
+    limit: float,
+    announce: Callable[[str], None],
 ) -> Iterator[Measurement]:
     """Measure ``count`` whole clients in rows ``apart`` [m], over three linked routers.
 
     ``seconds``: measured simulated time, in steps that each client has made. ``processes``: number of processes that
     share the clients. ``factor``: real-time factor of the world; None: as fast as all clients can follow. ``limit``:
-    real time [s] after which the benchmark gives up.
+    real time [s] after which the benchmark gives up, with the reason. ``announce`` is called with lines of text that
+    tell how far the clients are.
     """
     options = () if factor is None else ("--real-time-factor", f"{factor:g}")
     with contextlib.ExitStack() as stack:
@@ -341,9 +391,15 @@ def whole_clients(
         wanted = np.minimum((away < interest.BODY_DISTANCE - 1.0).sum(1) - 1, interest.MAX_BODIES)
 
         def until(condition: Callable[[list[dict[str, Any]]], bool], what: str) -> list[dict[str, Any]]:
-            while not condition(_clients(answers := _ask(crowd))):
-                if time.monotonic() > end:
-                    raise RuntimeError(f"{count} clients: {what} not after {limit:g} s")
+            """Returns the answers of all processes for which the condition holds."""
+            told_at = time.monotonic()
+            while not condition(reports := _clients(answers := _ask(crowd, end))):
+                now = time.monotonic()
+                if now > end:
+                    raise RuntimeError(f"{count} clients: not {what} after {limit:g} s: {_how_far(reports, wanted)}")
+                if now - told_at > NEWS_PERIOD:
+                    told_at = now
+                    announce(f"waiting until {what}: {_how_far(reports, wanted)}")
                 time.sleep(POLL)
             return answers
 
@@ -356,20 +412,20 @@ def whole_clients(
             "all know each other",
         )
         met = time.monotonic() - start
-        before = _ask(crowd, "work"), [cpu(process) for _, process in ends], time.monotonic()
-        after = _ask(crowd)
+        before = _ask(crowd, end, "work"), [cpu(process) for _, process in ends], time.monotonic()
         begun = np.array([one["time"] for one in _clients(before[0])])
-        while (spans := np.array([one["time"] for one in _clients(after)]) - begun).min() < seconds:
-            if time.monotonic() > end:
-                raise RuntimeError(f"{count} clients: not {seconds:g} s simulated after {limit:g} s")
-            time.sleep(POLL)
-            after = _ask(crowd)
+        after = until(
+            lambda reports: min(one["time"] - since for one, since in zip(reports, begun, strict=True)) >= seconds,
+            f"all have simulated {seconds:g} s",
+        )
+        spans = np.array([one["time"] for one in _clients(after)]) - begun
         router_time = sum(cpu(process) for _, process in ends) - sum(before[1])
         wall = time.monotonic() - before[2]
         received = [b["bytes_in"] - a["bytes_in"] for a, b in zip(_clients(before[0]), _clients(after), strict=True)]
         rates = np.array(received) / spans
         at_rest = until(
-            lambda reports: (found := _are_equal(reports))[0] == found[1] >= count and found[2], "equal records"
+            lambda reports: (found := _are_equal(reports))[0] == found[1] >= count and found[2],
+            "all records are equal",
         )
         objects, equal, _ = _are_equal(_clients(at_rest))
         reports = _clients(at_rest)
@@ -384,7 +440,9 @@ def whole_clients(
         ("routers' CPU, per simulated second", router_time / simulated, "s"),
         ("real-time factor", simulated / wall, ""),
         ("objects with a record", objects, "objects"),
-        ("of these at rest by the same record on all clients that have one", equal, "objects"),
+        ("of these at rest by the same record on all clients around", equal, "objects"),
+        ("signs of lost messages, all clients", sum(one["missed"] for one in reports), ""),
+        ("admissions by the server", sum(one["admissions"] for one in reports), ""),
         ("faults of all clients", sum(sum(one["faults"].values()) for one in reports), "faults"),
     )
     for what, value, unit in rows:
@@ -457,7 +515,14 @@ _UNITS = ("kB/s", "kB/s", "kB/s", "1/s", "kB/s", "cores", "", "s")
 
 
 def many_actors(
-    clients: int, apart: float, seconds: float, processes: int, factor: float | None, limit: float, simulated: list[int]
+    clients: int,
+    apart: float,
+    seconds: float,
+    processes: int,
+    factor: float | None,
+    limit: float,
+    simulated: list[int],
+    announce: Callable[[str], None],
 ) -> Iterator[Measurement]:
     """Measure ``simulated`` numbers of actors without physics, then ``clients`` whole clients (0: none), each for
     ``seconds`` of simulated time."""
@@ -465,4 +530,4 @@ def many_actors(
         for (what, value), unit in zip(walking_actors(count, seconds).items(), _UNITS, strict=True):
             yield Measurement("many_actors", f"{count} actors on 1 km2, without physics: {what}", value, unit)
     if clients:
-        yield from whole_clients(clients, apart, seconds, processes, factor, limit)
+        yield from whole_clients(clients, apart, seconds, processes, factor, limit, announce)

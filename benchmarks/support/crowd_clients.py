@@ -113,7 +113,9 @@ class Worker:
                 record = client.replicator.record(object_id(kind, number))
                 if record is not None:
                     digest = hashlib.blake2b(encode_records([record]), digest_size=8).hexdigest()
-                    records[f"{kind.name}/{number}"] = (digest, record.moving)
+                    cell = client.replicator.record_cell(object_id(kind, number))
+                    claim = (record.ownership, record.authority, record.author)
+                    records[f"{kind.name}/{number}"] = (digest, record.moving, claim, cell)
         return {
             "number": self.number,
             "time": client.physics.time,
@@ -123,6 +125,9 @@ class Worker:
             "placed": len(client.replicator.peer_positions()),
             "owned": len(client.replicator.owned),
             "records": records,
+            "window": list(client.replicator.record_window),
+            "missed": client.replicator.bus.missed,
+            "admissions": client.replicator.bus.admissions,
             "faults": {name: value for name, value in client.physics.faults.items() if value},
         }
 

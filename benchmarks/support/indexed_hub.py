@@ -68,7 +68,7 @@ class IndexedHub:
 class IndexedBus:
     """A member of the network. Implements :class:`vinesim.net.transport.bus.Bus`."""
 
-    dropped = foreign = failures = admissions = 0
+    dropped = missed = foreign = failures = admissions = 0
     status_message = ""
     spectators_speak_to = SpectatorsSpeakTo.PEOPLE
 

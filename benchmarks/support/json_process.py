@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import select
 import subprocess
 import sys
 from collections.abc import Callable
@@ -33,12 +34,15 @@ class JsonProcess:
         self.process.stdin.write(json.dumps(command) + "\n")
         self.process.stdin.flush()
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self, timeout: float | None = None) -> dict[str, Any]:
         """Returns the next answer.
 
-        Raises :class:`RuntimeError` if the process has ended.
+        ``timeout``: longest time to wait for its first byte [s]; None: no limit. Raises :class:`RuntimeError` if the
+        process has ended, or has not answered by then.
         """
         assert self.process.stdout is not None
+        if timeout is not None and not select.select([self.process.stdout], [], [], timeout)[0]:
+            raise RuntimeError(f"{self._module} (process {self.process.pid}) has not answered for {timeout:.0f} s")
         line = self.process.stdout.readline()
         if not line:
             raise RuntimeError(f"{self._module} ended with exit status {self.process.wait()}")

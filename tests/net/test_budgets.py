@@ -308,6 +308,7 @@ def test_the_memory_of_a_server_and_of_a_client_does_not_grow_with_joins_and_lea
     monkeypatch.setattr("vinesim.net.server.server.MAX_WARNED", 20)
     monkeypatch.setattr("vinesim.net.server.server.MAX_KNOWN_SESSIONS", 20)
     monkeypatch.setattr(name_holders, "MAX_FORMER_NAMES", 50)
+    monkeypatch.setattr(admission, "MAX_DEPARTED", 50)
     monkeypatch.setattr(retained_store, "MAX_BUCKETS", 50)
     monkeypatch.setattr(retained_store, "BURST_TIME", 0.1)
     with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:

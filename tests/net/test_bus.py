@@ -50,12 +50,24 @@ def test_a_sample_store_keeps_the_newest_of_each_key_in_order(samples):
     assert store.take() == []
 
 
+def test_poses_push_no_event_out_of_a_store_that_nobody_reads():
+    store = SampleStore()
+    store.put(KEEP_ALL, "own", b"event")
+    for number in range(5 * KEEP_ALL):
+        store.put(KEEP_LAST_1, f"a/{number % 300}", b"%d" % number)
+    store.put(KEEP_ALL, "own", b"another")
+    taken = store.take()
+    assert [payload for key, payload in taken if key == "own"] == [b"event", b"another"]
+    assert [int(payload) for key, payload in taken if key != "own"] == list(range(5 * KEEP_ALL - 300, 5 * KEEP_ALL))
+    assert (store.overflowed, store.missed) == (0, 0)
+
+
 def test_samples_beyond_the_depth_are_dropped_and_counted():
     store = SampleStore()
     for number in range(KEEP_ALL + 5):
         store.put(KEEP_ALL, "e", b"%d" % number)
     assert len(store.take()) == KEEP_ALL
-    assert store.overflowed == 5
+    assert (store.overflowed, store.missed) == (5, 5)
 
 
 def test_the_bytes_that_wait_to_be_polled_are_bounded():

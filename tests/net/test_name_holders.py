@@ -211,6 +211,18 @@ def test_those_who_saw_the_first_session_keep_to_it_and_others_believe_neither()
         assert each.live == frozenset()
 
 
+def test_a_thousand_names_keep_their_holders_while_the_connection_is_lost():
+    names = NameHolders()
+    tokens = [(f"actor{number}", f"{number}") for number in range(1000)]
+    names.start(tokens)
+    names.refresh([])
+    assert names.live == frozenset()
+    assert [names.holder(name) for name, _ in tokens] == [session for _, session in tokens]
+    assert names.returned == 0
+    names.refresh(tokens)
+    assert names.returned == 1000
+
+
 @given(st.lists(st.tuples(st.sampled_from("123"), st.booleans()), max_size=30))
 def test_no_session_takes_a_name_while_its_holder_is_live(changes):
     names = NameHolders()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from vinesim.net.codec.control import RetainedRecord, decode_records, encode_records
 from vinesim.net.codec.header import MAX_DATAGRAM
 from vinesim.net.codec.messages import Counters
-from vinesim.net.replication.retained_sync import RetainedSync
+from vinesim.net.replication.retained_sync import REPAIR_DELAY, REPAIR_PERIOD, RetainedSync
 from vinesim.net.transport.bus import KEEP_ALL
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.ids import ObjectKind, object_id
@@ -101,3 +101,65 @@ def test_each_cell_is_queried_once_and_again_when_it_is_entered_again():
     ada.update_window([HERE], 2, hub.time)
     hub.advance(0.01)
     assert len(queries) == 2
+
+
+def test_records_are_exchanged_again_some_time_after_a_message_was_dropped():
+    """Ada receives a record under bob's name from a session that does not seem to hold it, and drops it."""
+    hub = MemoryHub()
+    ada = RetainedSync(hub.bus("ada"), Counters())
+    server = hub.bus("server")
+    queries = []
+    server.declare_queryable("snap/0/0", lambda _: queries.append(hub.time) or encode_records([record(3, 1.0, "bob")]))
+    server.subscribe("fact/**", KEEP_ALL)
+    ada.publish(HERE, record(0))
+    run(hub, ada)
+    ada.mark_answered(HERE)
+    assert received(server) == [("fact/0/0/ada", 1)]
+    for _ in range(5):
+        server.publisher("fact/0/0/bob").put(encode_records([record(3, 1.0, "bob")]))
+    server.publisher("a/bob").put(b"a pose, to which nobody subscribes")
+    run(hub, ada, 2)
+    assert ada.bus.missed == 5
+    assert ada.bus.poll() == []
+    run(hub, ada, round(0.9 * REPAIR_DELAY / 0.01))
+    assert len(queries) == 1
+    run(hub, ada, round(0.11 * REPAIR_DELAY / 0.01))
+    assert (received(server), len(queries)) == ([("fact/0/0/ada", 1)], 2)
+    ada.mark_answered(HERE)
+    run(hub, ada, round(2.0 * REPAIR_PERIOD / 0.01))
+    assert (received(server), len(queries)) == ([], 2), "once for all"
+
+
+def test_false_messages_make_an_actor_exchange_its_records_seldom():
+    hub = MemoryHub()
+    ada = RetainedSync(hub.bus("ada"), Counters())
+    server = hub.bus("server")
+    queries = []
+    server.declare_queryable("snap/0/0", lambda _: queries.append(hub.time) or encode_records([]))
+    false = server.publisher("fact/0/0/bob")
+    start = hub.time
+    while hub.time < start + 5.0 * REPAIR_PERIOD:
+        false.put(b"false")
+        run(hub, ada, 1)
+        ada.mark_answered(HERE)
+    assert 4 <= len(queries) <= 6
+
+
+def test_records_are_exchanged_again_after_a_loss_of_the_connection_that_the_loop_did_not_see():
+    """A loop that gets no processor time finds the connection as it was, and one more admission."""
+    hub = MemoryHub()
+    ada = RetainedSync(hub.bus("ada"), Counters())
+    server = hub.bus("server")
+    server.subscribe("fact/**", KEEP_ALL)
+    queries = []
+    server.declare_queryable("snap/0/0", lambda _: queries.append(hub.time) or encode_records([]))
+    ada.publish(HERE, record(0))
+    run(hub, ada)
+    ada.mark_answered(HERE)
+    assert (received(server), len(queries)) == ([("fact/0/0/ada", 1)], 1)
+    hub.admissions += 1
+    run(hub, ada)
+    assert (received(server), len(queries)) == ([("fact/0/0/ada", 1)], 2)
+    ada.mark_answered(HERE)
+    run(hub, ada, 2000)
+    assert (received(server), len(queries)) == ([], 2)

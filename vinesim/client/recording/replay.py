@@ -143,7 +143,7 @@ def _cell(key: str) -> tuple[int, int] | None:
 class ReplayBus:
     """A bus in a recorded world, see :class:`vinesim.net.transport.bus.Bus`. Published messages are discarded."""
 
-    bytes_out = failures = foreign = 0
+    bytes_out = failures = foreign = missed = 0
     status_message = ""
 
     def __init__(

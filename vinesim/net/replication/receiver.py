@@ -201,7 +201,10 @@ class Receiver:
             if sender not in state.peers.local_actors:
                 if key != interest.FAR_KEY.format(actor=sender):
                     state.peers.ask_soon(sender)
-                counters.dropped += self._keep_early(sender, key, payload) if family == "fact" else 1
+                discarded = self._keep_early(sender, key, payload) if family == "fact" else 1
+                counters.dropped += discarded
+                if discarded and family == "fact":
+                    state.retained.repair(step.now)
             return
         try:
             if peer is not None and peer.hello.kind == SPECTATOR and not FAMILIES[family].by_spectators:

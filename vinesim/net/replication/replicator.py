@@ -23,6 +23,7 @@ from vinesim.net.replication import interest
 from vinesim.net.replication.authority import Claim
 from vinesim.net.replication.clock_sync import STEP_THRESHOLD
 from vinesim.net.replication.direct_messages import HAND_FORCE, LinkCentre
+from vinesim.net.replication.interest import Cell
 from vinesim.net.replication.receiver import Inbox, Receiver
 from vinesim.net.replication.replication_state import ReplicationState
 from vinesim.net.replication.sender import LocalStep, Sender
@@ -132,6 +133,16 @@ class Replicator:
     def record(self, object_id: int) -> RetainedRecord | None:
         """Returns the retained record of an object, or None."""
         return self._state.retained.state.get(object_id)
+
+    @property
+    def record_window(self) -> frozenset[Cell]:
+        """Cells whose retained records this actor receives now. Of other cells it may know records that are no longer
+        valid."""
+        return self._state.retained.window
+
+    def record_cell(self, object_id: int) -> Cell | None:
+        """Returns the cell of the retained record of an object, or None."""
+        return self._state.retained.state.cell_of(object_id)
 
     @property
     def owned(self) -> frozenset[int]:

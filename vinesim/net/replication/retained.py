@@ -57,6 +57,10 @@ class RetainedState:
         cell = self._cell_of.get(object_id)
         return None if cell is None else self._records[cell][object_id]
 
+    def cell_of(self, object_id: int) -> Cell | None:
+        """Returns the cell of the record of an object, or None."""
+        return self._cell_of.get(object_id)
+
     def in_cell(self, cell: Cell) -> list[RetainedRecord]:
         """Returns the records of all objects in a cell, in the order of object ids."""
         here = self._records.get(cell, {})

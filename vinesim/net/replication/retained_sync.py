@@ -2,7 +2,10 @@
 
 A record is published once, wherever the peers are, because the server keeps it for others. Records of peers arrive by
 subscription, and earlier records of a cell by a query to the server. When the connection to the server was lost and is
-back, the actor publishes all its own records again, because the server may be a new one without records.
+back, the actor publishes all its own records again, because the server may be a new one without records, and queries
+all cells again. It also does so some time after signs that messages were lost on their way, like a message of a session
+that did not seem to hold its name, or a connection between others that was lost. So a machine that is overloaded delays
+records and loses none.
 """
 
 from __future__ import annotations
@@ -23,6 +26,13 @@ QUERY_TIMEOUT = 0.5
 MAX_QUERY_PERIOD = 8.0
 """Longest time between two repetitions of a query without a reply [s]."""
 
+REPAIR_DELAY = 8.0
+"""Time from a sign of lost messages until records are exchanged again [s]. By then the server has what the messages
+said, even if their sender had to join again. GUESSED."""
+
+REPAIR_PERIOD = 30.0
+"""Shortest time between two such exchanges [s], whatever others send. GUESSED."""
+
 TYPICAL_RECORD_SIZE = 110
 """Upper estimate of the size of an encoded record without the state of a tree [B]."""
 
@@ -40,6 +50,13 @@ class RetainedSync:
         self._subscriptions: dict[Cell, Subscription] = {}
         self._asked: dict[Cell, tuple[float, float]] = {}
         self._is_disconnected = False
+        self._admissions = 0
+        """Number of admissions of this actor when the records were last published and queried for a new connection."""
+        self._missed = 0
+        """Number of signs of lost messages after which records were exchanged again or will be."""
+        self._repair_due = math.inf
+        """Time at which records are exchanged again because messages may be lost [s]."""
+        self._repaired_at = -math.inf
         self._window_changes = -1
         self._next_query = math.inf
         """Time at which the next query to the server is due [s]."""
@@ -70,23 +87,36 @@ class RetainedSync:
         """Subscribe to the records of the cells in ``window``, and query the server for the records of new cells.
 
         ``changes``: number of changes of the window so far. ``now``: own time [s]. Returns at once if neither the
-        window nor the connection to the server has changed and no query is due.
+        window nor the connection to the server has changed, no message may be lost and no query is due.
         """
         is_disconnected = bool(self.bus.status_message)
+        # a loop that gets no processor time may not see that the connection is lost, but the server admits it again
+        admissions = self._admissions if is_disconnected else self.bus.admissions
         if (
             (now < self._next_query or is_disconnected)
             and is_disconnected == self._is_disconnected
+            and admissions == self._admissions
+            and (self.bus.missed == self._missed or self._repair_due < math.inf)
             and changes == self._window_changes
             and len(self._publishers) == len(window)
         ):
             return
         wanted = set(window)
         self._window_changes = changes
-        if self._is_disconnected and not is_disconnected:
+        is_new_connection = admissions != self._admissions or (self._is_disconnected and not is_disconnected)
+        is_repair = now >= self._repair_due and not is_disconnected
+        if is_repair:
+            self._repair_due = math.inf
+            self._repaired_at = now
+        if is_new_connection or is_repair:
             for object_id, (cell, record) in self._authored.items():
                 self._pending.setdefault(cell, {})[object_id] = record
             self._asked = dict.fromkeys(wanted, (now, QUERY_TIMEOUT))
+        self._admissions = admissions
         self._is_disconnected = is_disconnected
+        if self._repair_due == math.inf and self.bus.missed != self._missed:
+            self._missed = self.bus.missed
+            self.repair(now)
         for cell in sorted(self._subscriptions.keys() - wanted):
             self._subscriptions.pop(cell).close()
             self._asked.pop(cell, None)
@@ -103,6 +133,18 @@ class RetainedSync:
                     self._asked[cell] = now + period, min(2.0 * period, MAX_QUERY_PERIOD)
                     self.bus.query(f"snap/{cell[0]}/{cell[1]}")
         self._next_query = min((due for due, _ in self._asked.values()), default=math.inf)
+        self._next_query = min(self._next_query, self._repair_due)
+
+    @property
+    def window(self) -> frozenset[Cell]:
+        """Cells whose records this actor receives now. Of other cells it may know records that are no longer valid."""
+        return frozenset(self._subscriptions)
+
+    def repair(self, now: float) -> None:
+        """Exchange all records again after :data:`REPAIR_DELAY`, because a message was lost at own time ``now`` [s]."""
+        if self._repair_due == math.inf:
+            self._repair_due = max(now + REPAIR_DELAY, self._repaired_at + REPAIR_PERIOD)
+        self._next_query = min(self._next_query, self._repair_due)
 
     def mark_answered(self, cell: Cell) -> None:
         """Note that the server has replied to the query for a cell."""

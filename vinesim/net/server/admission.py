@@ -26,8 +26,9 @@ before join again. Afterwards only a join reserves a name."""
 SEVERAL = "several"
 """Returned instead of a session if several sessions claim a name."""
 
-MAX_DEPARTED = 256
-"""Largest number of actors that have left and whose last records are still accepted."""
+MAX_DEPARTED = 4096
+"""Largest number of actors that have left and whose last records are still accepted. All actors behind a linked server
+leave at once when the link is lost."""
 
 MAX_TOKENS = 20_000
 """Largest number of liveliness tokens that the server notes."""

@@ -26,6 +26,10 @@ KEEP_LAST_64 = 64
 KEEP_ALL = 10_000
 """History depth that keeps all samples of each key, in order. For events. The number only bounds the memory."""
 
+MIN_REPLACED = KEEP_ALL // 10
+"""Number of samples with a smaller depth than ``KEEP_ALL`` after which a full :class:`SampleStore` looks for those that
+newer ones replace. A look takes some ms, so that it costs some us a sample. GUESSED."""
+
 MAX_STORED_BYTES = 64 << 20
 """Largest size of all payloads that wait for :meth:`Bus.poll` [B]."""
 
@@ -108,6 +112,14 @@ class Bus(Protocol):
 
     foreign: int
     """Number of samples and replies that were dropped because another session holds the name in their key."""
+
+    @property
+    def missed(self) -> int:
+        """Number of signs that reliable samples did not arrive: samples of subscriptions with the depth ``KEEP_ALL``
+        that were discarded for any reason, and names that were not live for a while, because a connection between
+        others was lost."""
+        ...
+
     failures: int
     """Number of puts, declarations and queries that failed on the network. They are counted and raise nothing."""
 
@@ -225,31 +237,54 @@ class SampleStore:
     def __init__(self) -> None:
         self._samples: collections.deque[tuple[int, str, bytes]] = collections.deque()
         self._bytes = 0
+        self._replaceable = 0
+        """Number of samples with a depth below ``KEEP_ALL`` since newer ones last replaced older ones."""
         self._lock = threading.Lock()
         self.overflowed = 0
+        self.missed = 0
+        """Number of samples with the depth ``KEEP_ALL`` among those that overflowed."""
 
     def put(self, depth: int, key: str, payload: bytes) -> None:
-        """Append a sample of a subscription with this history ``depth``. If there is no room, drop the oldest
-        samples."""
+        """Append a sample of a subscription with this history ``depth``. If there is no room, newer samples replace
+        older ones beyond the depth of their key. If that is not enough, drop the oldest samples.
+
+        So the poses of a crowd push out no event of a real-time loop that gets no processor time.
+        """
         with self._lock:
             self._samples.append((depth, key, payload))
             self._bytes += len(payload)
-            while len(self._samples) > KEEP_ALL or (self._bytes > MAX_STORED_BYTES and len(self._samples) > 1):
-                self._bytes -= len(self._samples.popleft()[2])
+            self._replaceable += depth < KEEP_ALL
+            if self._is_over_full() and self._replaceable > MIN_REPLACED:
+                self._samples = collections.deque(_newest(self._samples))
+                self._bytes = sum(len(kept) for _, _, kept in self._samples)
+                self._replaceable = 0
+            while self._is_over_full():
+                dropped_depth, _, dropped = self._samples.popleft()
+                self._bytes -= len(dropped)
                 self.overflowed += 1
+                self.missed += dropped_depth >= KEEP_ALL
+
+    def _is_over_full(self) -> bool:
+        return len(self._samples) > KEEP_ALL or (self._bytes > MAX_STORED_BYTES and len(self._samples) > 1)
 
     def take(self) -> list[tuple[str, bytes]]:
         """Remove and return all samples in order of arrival, without those beyond the history depth of their key."""
         with self._lock:
             taken = self._samples
             self._samples = collections.deque()
-            self._bytes = 0
-        left: dict[str, int] = {}
-        kept = []
-        for depth, key, payload in reversed(taken):
-            free = left.get(key, depth)
-            left[key] = free - 1
-            if free > 0:
-                kept.append((key, payload))
-        kept.reverse()
-        return kept
+            self._bytes = self._replaceable = 0
+        return [(key, payload) for _, key, payload in _newest(taken)]
+
+
+def _newest(samples: collections.deque[tuple[int, str, bytes]]) -> list[tuple[int, str, bytes]]:
+    """Returns samples (depth, key, payload) without those beyond the history depth of their key, in the same order."""
+    left: dict[str, int] = {}
+    kept = []
+    for sample in reversed(samples):
+        depth, key, _ = sample
+        free = left.get(key, depth)
+        left[key] = free - 1
+        if free > 0:
+            kept.append(sample)
+    kept.reverse()
+    return kept

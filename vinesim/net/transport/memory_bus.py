@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Self
 
 from vinesim.audio.hearing import SpectatorsSpeakTo
-from vinesim.net.transport.bus import KEEP_LAST_1, JoinRejected, NameTaken, Reply, SampleStore, matches
+from vinesim.net.transport.bus import KEEP_ALL, KEEP_LAST_1, JoinRejected, NameTaken, Reply, SampleStore, matches
 from vinesim.net.transport.name_holders import bound_name
 
 MAX_KNOWN_KEYS = 10_000
@@ -42,6 +42,8 @@ class MemoryHub:
         """Function that returns why the emulated server rejects a hello; empty if it admits the actor."""
         self.spectators_speak_to = SpectatorsSpeakTo.PEOPLE
         """Actors that hear spectators, as set by the emulated server."""
+        self.admissions = 0
+        """Number of times that the emulated server has admitted each member."""
         self._random = random.Random(seed)
         self._order = 0
         self._pending: list[tuple[float, int, Callable[[], None]]] = []
@@ -172,7 +174,11 @@ class MemoryHub:
         return is_foreign
 
     def _deliver(self, bus: MemoryBus, source: str, key: str, payload: bytes) -> None:
-        if not self.down and not self._is_foreign(bus, source, key):
+        if self.down:
+            return
+        if self._is_foreign(bus, source, key):
+            bus.miss(key)
+        else:
             bus.deliver(key, payload)
 
 
@@ -218,7 +224,7 @@ class MemoryBus:
     def __init__(self, hub: MemoryHub, name: str) -> None:
         self.hub = hub
         self.name = name
-        self.bytes_in = self.bytes_out = self.failures = self.foreign = 0
+        self.bytes_in = self.bytes_out = self.failures = self.foreign = self._missed = 0
         self.queryables: dict[str, Callable[[bytes], bytes]] = {}
         self.pending_replies: list[tuple[str, bytes, float]] = []
         self._store = SampleStore()
@@ -230,6 +236,10 @@ class MemoryBus:
     @property
     def dropped(self) -> int:
         return self._store.overflowed
+
+    @property
+    def missed(self) -> int:
+        return self._missed + self._store.missed
 
     @property
     def status_message(self) -> str:
@@ -274,6 +284,10 @@ class MemoryBus:
             self.bytes_in += len(payload)
             self._store.put(depth, key, payload)
 
+    def miss(self, key: str) -> None:
+        """Note that a sample under a key was not delivered."""
+        self._missed += self._depth_of(key) >= KEEP_ALL
+
     def poll(self) -> list[tuple[str, bytes]]:
         return self._store.take()
 
@@ -295,7 +309,7 @@ class MemoryBus:
 
     @property
     def admissions(self) -> int:
-        return 0
+        return self.hub.admissions
 
     def declare_queryable(self, key: str, respond: Callable[[bytes], bytes]) -> None:
         self.queryables[key] = respond

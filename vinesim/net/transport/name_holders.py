@@ -19,8 +19,9 @@ from vinesim.net.codec.messages import FAMILIES, sender_of
 MAX_FORMER_SESSIONS = 8
 """Largest number of sessions that have left and are still stored, for one name."""
 
-MAX_FORMER_NAMES = 256
-"""Largest number of names without a live session that are still stored."""
+MAX_FORMER_NAMES = 4096
+"""Largest number of names without a live session that are still stored. When a connection is lost, all names behind it
+lose their sessions at once, and messages may come back before the tokens do: more than a world has actors."""
 
 BOUND_FAMILIES = frozenset(name for name, family in FAMILIES.items() if family.is_published) | {"hello", "robot"}
 """Families of keys that contain the name of the actor that may send under them, by their first chunk."""
@@ -52,6 +53,8 @@ class NameHolders:
         self._lock = threading.Lock()
         self.live = own
         """Names that have a live session, and the own names."""
+        self.returned = 0
+        """Number of times that a name without a live session got one again: the connection to it was lost."""
 
     def start(self, tokens: list[tuple[str, str]]) -> None:
         """Store all tokens, as (name, session), that existed before this member joined."""
@@ -77,7 +80,9 @@ class NameHolders:
                 del sessions[one]
             self._choose(name)
             if any(sessions.values()):
-                self._departed.pop(name, None)
+                if name in self._departed:
+                    del self._departed[name]
+                    self.returned += 1
                 if name not in self.live:
                     self.live |= {name}
                 return

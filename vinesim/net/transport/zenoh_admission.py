@@ -25,9 +25,9 @@ log = logging.getLogger(__name__)
 RETRY_PERIOD = 0.05
 """Time between two attempts to reach a server that has just started, or was restarted [s]."""
 
-REJOIN_TIMEOUT = 8.0
-"""Time for which the server may refuse a session that replaces another one [s]: it forgets a silent session after its
-lease of 2 s."""
+REJOIN_TIMEOUT = 60.0
+"""Time for which the server may refuse a session that replaces another one [s]. It forgets a silent session after its
+lease of 2 s, and on a machine that is overloaded much later."""
 
 ROS_TOKENS = "@ros2_lv/**"
 """Keys of the liveliness tokens by which nodes with ``rmw_zenoh`` announce themselves and their topics."""

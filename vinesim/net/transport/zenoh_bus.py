@@ -130,6 +130,7 @@ class ZenohBus:
         self.world = world
         self.endpoint = str(links.bulk)
         self.bytes_in = self.bytes_out = self._oversized = self.failures = self.foreign = 0
+        self._missed = 0
         self.early = 0
         """Number of messages that were dropped because their session had not shown its public key yet, as it does once
         a second."""
@@ -473,7 +474,9 @@ class ZenohBus:
         self.foreign += 1
         if self.foreign == 1:
             log.warning(
-                "%s: dropped %s from a session that does not hold the name %r; further messages are only counted",
+                "%s: dropped %s from a session that does not hold the name %r as far as is known here: after a lost "
+                "connection this ends by itself, and the records are asked for again; if it goes on, another program "
+                "speaks under that name; further messages are only counted",
                 self.name,
                 key[:100],
                 name[:50],
@@ -485,6 +488,10 @@ class ZenohBus:
     @property
     def dropped(self) -> int:
         return self._store.overflowed + self._oversized + self._budget.dropped
+
+    @property
+    def missed(self) -> int:
+        return self._missed + self._store.missed + self._names.returned
 
     @property
     def status_message(self) -> str:
@@ -528,6 +535,7 @@ class ZenohBus:
             source = sample.source_info
             seal = sample.attachment
             key = str(sample.key_expr)[skip:]
+            is_taken = False
             if size > MAX_MESSAGE:
                 self._oversized += 1
             elif self.is_secured and not self._budget.admits(bound_name(key), time.monotonic()):
@@ -538,6 +546,8 @@ class ZenohBus:
                     pass
                 elif self.is_secured or self._budget.admits(bound_name(key), time.monotonic()):
                     self._store.put(depth, key, payload)
+                    is_taken = True
+            self._missed += depth >= KEEP_ALL and not is_taken
             self.bytes_in += size
             self.seal_bytes_in += 0 if seal is None else len(seal)
 

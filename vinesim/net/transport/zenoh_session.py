@@ -56,7 +56,7 @@ class SessionRefused(ServerUnreachable):
             self,
             f"{endpoint} accepts connections but opened no session within {waited:g} s: a vinesim server there has as "
             "many sessions as it admits (its log then has a line, and --max-sessions or --max-clients raises the "
-            "number), or another program listens there",
+            "number), its machine is overloaded (try again), or another program listens there",
         )
 
 
