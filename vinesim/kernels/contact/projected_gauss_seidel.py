@@ -132,7 +132,37 @@ def solve_island(
                     copy_rows(first, last, system_out.impulse, system_out.impulse_first)
                 gradient = wp.float64(0.0)
                 newton_step(island, islands_out, matrix, system_out)
+    if busy:
+        end_growth(island, islands_out, matrix, system_out)
     islands_out.sweeps[island] = sweeps
+
+
+@wp.func
+def end_growth(island: int, islands: Islands, matrix: wp.array(dtype=wp.float64), system_out: IslandSystem):
+    """Scale the impulses x of an island whose solve did not converge, so that they add no energy: x . r <= 0.
+
+    In a solution the residual velocities r are 0 along normals that press and opposite to friction, so a solution is
+    not changed. Impulses far from a solution can add any energy. Of the impulses s x with s from 0 to 1, which lie in
+    the same friction cones, the largest that add no energy have s = -x . r_0 / x . (r - r_0), where r_0 are the
+    residuals without impulses.
+    """
+    zero = wp.float64(0.0)
+    free = wp.float64(0.0)
+    own = wp.float64(0.0)
+    for block in range(islands.first_block[island], islands.first_block[island + 1]):
+        for place in range(islands.block_start[block], islands.block_start[block + 1]):
+            row = contact_row(place, block, islands)
+            x = three(row, system_out.impulse)
+            before = three(row, system_out.free)
+            free = free + wp.dot(x, before)
+            own = own + wp.dot(x, contact_residual(place, block, island, islands, matrix, system_out) - before)
+    if free + own > zero:
+        share = wp.max(zero, -free / own)
+        for row in range(
+            islands.row_start[islands.first_block[island]], islands.row_start[islands.first_block[island + 1]]
+        ):
+            system_out.impulse[row] = share * system_out.impulse[row]
+        update_rigid_velocity(island, islands, system_out)
 
 
 @wp.kernel
