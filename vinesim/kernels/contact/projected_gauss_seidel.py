@@ -104,9 +104,10 @@ def solve_island(
 
     Gauss-Seidel converges slowly if contacts depend strongly on each other, such as two fingers around a bunch. It
     finds the states of contacts (sticking, sliding, open) within a few sweeps, but takes a hundred sweeps for the
-    impulses. So islands of small blocks at first take a Newton step after every sweep. If these steps do not converge,
-    sweeps continue from the impulses before the first Newton step, with conjugate gradients. In islands with a large
-    block, conjugate gradients are used from the first sweep on.
+    impulses. So islands of small blocks at first take a Newton step after every sweep, then one in
+    :data:`NEWTON_PERIOD`, and conjugate gradients between. Newton steps may lead away from the solution. They are kept
+    only if the next sweep changes the impulses less than the sweep before the steps; otherwise sweeps continue from the
+    impulses before the steps. In islands with a large block, conjugate gradients are used from the first sweep on.
     """
     first = islands_out.row_start[islands_out.first_block[island]]
     last = islands_out.row_start[islands_out.first_block[island + 1]]
@@ -115,21 +116,27 @@ def solve_island(
         newton_end = 0
     sweeps = int(0)
     gradient = wp.float64(0.0)
+    change_first = wp.float64(0.0)
+    is_untested = bool(False)
     busy = bool(True)
     while busy and sweeps < max_sweeps:
         copy_rows(first, last, system_out.impulse, system_out.impulse_before)
         change, largest = sweep(island, islands_out, matrix, system_out)
         sweeps = sweeps + 1
         busy = change > tolerance * largest
-        if busy and sweeps < max_sweeps:
-            if sweeps == newton_end + 1 and newton_end > 0:
-                copy_rows(first, last, system_out.impulse_first, system_out.impulse)
-                update_rigid_velocity(island, islands_out, system_out)
-            elif sweeps > newton_end and (newton_end == 0 or sweeps % NEWTON_PERIOD != 0):
+        if busy and is_untested and sweeps > newton_end and change > change_first:
+            copy_rows(first, last, system_out.impulse_first, system_out.impulse)
+            update_rigid_velocity(island, islands_out, system_out)
+            is_untested = False
+        elif busy and sweeps < max_sweeps:
+            if sweeps > newton_end and (newton_end == 0 or sweeps % NEWTON_PERIOD != 0):
                 gradient = follow_conjugate_direction(island, first, last, gradient, islands_out, system_out)
+                is_untested = False
             else:
-                if sweeps == 1:
+                if not is_untested:
                     copy_rows(first, last, system_out.impulse, system_out.impulse_first)
+                    change_first = change
+                is_untested = True
                 gradient = wp.float64(0.0)
                 newton_step(island, islands_out, matrix, system_out)
     if busy:
