@@ -357,8 +357,8 @@ class ImpulseSolver:
         The solve assumes a linear response to impulses, but contacts of a body with its support may open or begin to
         slide. A light body gains energy if the solve assumes that its support holds it while it slides or lifts off.
         Each round is a Newton step from the last impulses, with the tangent stiffness of the constraints under them.
-        If no round reaches the tolerance, the impulses of the round with the least error are kept, as far as they add no
-        energy; see :meth:`_end_growth`.
+        If no round reaches the tolerance, the impulses of the round with the least error are kept, as far as they add
+        no energy; see :meth:`_end_growth`.
         """
         rows = self.rows
         system = self.system
