@@ -418,26 +418,29 @@ class ImpulseSolver:
         jacobian = by_rows(rows.rigid_jacobian[:count])
         impulse = rows.impulse[: 3 * count]
         whole = impulse.copy()
-        given = whole * (velocity_free + rows.bias[: 3 * count])
-        own = whole**2 * np.repeat(self.contacts.surface["compliance"][:count], 3)
-        free, stiff = (np.bincount(of_contact, work.reshape(-1, 3).sum(1), islands) for work in (given, own))
+
+        def by_island(work: np.ndarray) -> np.ndarray:
+            return np.bincount(of_contact, work.reshape(-1, 3).sum(1), islands)
+
+        free = by_island(whole * (velocity_free + rows.bias[: 3 * count]))
+        own = by_island(whole**2 * np.repeat(self.contacts.surface["compliance"][:count], 3))
         for island in range(islands):
             for block in range(lists.first_block[island], lists.first_block[island + 1]):
                 first, end = lists.row_start[block : block + 2]
                 used = 3 * int(lists.block_start[block + 1] - lists.block_start[block])
                 at = lists.matrix_start[block]
                 matrix = rows.delassus[at : at + used * (end - first)].reshape(used, -1)
-                stiff[island] += system.impulse[first : first + used] @ matrix @ system.impulse[first:end]
+                own[island] += system.impulse[first : first + used] @ matrix @ system.impulse[first:end]
         rounding = self.parameters.solver_constraint_tolerance * np.bincount(of_contact, whole[::3], islands)
         share = np.ones(islands)
         for halvings in range(MAX_HALVINGS + 1):
             self.rigid.predict_with(self.rigid_force)
             moved = whole * (jacobian @ (self.rigid.velocity_free - rigid_free))
-            work = free + share * stiff - np.bincount(of_contact, moved.reshape(-1, 3).sum(1), islands)
+            work = free + share * own - by_island(moved)
             growing = np.flatnonzero((work > rounding) & (share > 0.0))
             if len(growing) == 0:
                 return
-            factor = 0.5 if halvings < MAX_HALVINGS - 1 else 0.0
+            factor = 0.5 if halvings < MAX_HALVINGS else 0.0
             for island in growing.tolist():
                 share[island] *= factor
                 dofs = slice(lists.first_dof[island], lists.first_dof[island + 1])
