@@ -33,6 +33,8 @@ BLOW_SWEEPS = 100
 """Largest number of sweeps of :func:`pressing_impulses`. TUNED: ten are usual."""
 BLOW_TOLERANCE = 1e-3
 """[1] The sweeps end when no impulse changes by more than this share of the largest one."""
+MAX_HALVINGS = 8
+"""Number of times that impulses which add energy are halved before they are left out. GUESSED"""
 REMOVED_GEOM = np.iinfo(np.int32).max
 """Index that the stored impulses of the last step (warm start) have for a geom that no longer exists."""
 
@@ -355,7 +357,8 @@ class ImpulseSolver:
         The solve assumes a linear response to impulses, but contacts of a body with its support may open or begin to
         slide. A light body gains energy if the solve assumes that its support holds it while it slides or lifts off.
         Each round is a Newton step from the last impulses, with the tangent stiffness of the constraints under them.
-        The impulses of the round with the least error are kept.
+        If no round reaches the tolerance, the impulses of the round with the least error are kept, as far as they add
+        no energy; see :meth:`_end_growth`.
         """
         rows = self.rows
         system = self.system
@@ -368,6 +371,8 @@ class ImpulseSolver:
         of_islands = system.impulse[: self._padded_rows]
         kept = (impulse, velocity_free, of_islands, system.velocity, system.rigid_force)
         free = self.rigid.velocity_free
+        free_first = free
+        free_rows = velocity_free.copy()
         best = ()
         best_error = np.inf
         error = np.inf
@@ -391,6 +396,59 @@ class ImpulseSolver:
         if error > best_error:
             for values, those in zip(kept, best, strict=True):
                 values[:] = those
+        self._end_growth(count, free_rows, free_first)
+
+    def _end_growth(self, count: int, velocity_free: np.ndarray, rigid_free: np.ndarray) -> None:
+        """Halve the impulses of each island until they add no energy with the velocities that MuJoCo computes for them.
+
+        This is the law x . r <= 0 of :func:`vinesim.kernels.contact.projected_gauss_seidel.end_growth`, for a response
+        that is not linear. MuJoCo minimises a convex function, so halving ends: x . r falls with the impulses.
+
+        Args:
+            count: number of contacts.
+            velocity_free: [row] m/s, velocities along the rows of the contacts without impulses.
+            rigid_free: [dof] m/s or rad/s, velocities of the rigid world without impulses.
+        """
+        rows = self.rows
+        system = self.system
+        lists = self.islands
+        islands = self.island_count
+        assert self.rigid_force is not None
+        of_contact = self.contacts.island[:count]
+        jacobian = by_rows(rows.rigid_jacobian[:count])
+        impulse = rows.impulse[: 3 * count]
+        whole = impulse.copy()
+
+        def by_island(work: np.ndarray) -> np.ndarray:
+            return np.bincount(of_contact, work.reshape(-1, 3).sum(1), islands)
+
+        free = by_island(whole * (velocity_free + rows.bias[: 3 * count]))
+        own = by_island(whole**2 * np.repeat(self.contacts.surface["compliance"][:count], 3))
+        for island in range(islands):
+            for block in range(lists.first_block[island], lists.first_block[island + 1]):
+                first, end = lists.row_start[block : block + 2]
+                used = 3 * int(lists.block_start[block + 1] - lists.block_start[block])
+                at = lists.matrix_start[block]
+                matrix = rows.delassus[at : at + used * (end - first)].reshape(used, -1)
+                own[island] += system.impulse[first : first + used] @ matrix @ system.impulse[first:end]
+        rounding = self.parameters.solver_constraint_tolerance * np.bincount(of_contact, whole[::3], islands)
+        share = np.ones(islands)
+        for halvings in range(MAX_HALVINGS + 1):
+            self.rigid.predict_with(self.rigid_force)
+            moved = whole * (jacobian @ (self.rigid.velocity_free - rigid_free))
+            work = free + share * own - by_island(moved)
+            growing = np.flatnonzero((work > rounding) & (share > 0.0))
+            if len(growing) == 0:
+                return
+            factor = 0.5 if halvings < MAX_HALVINGS else 0.0
+            for island in growing.tolist():
+                share[island] *= factor
+                dofs = slice(lists.first_dof[island], lists.first_dof[island + 1])
+                blocks = lists.row_start[lists.first_block[island : island + 2]]
+                system.impulse[slice(*blocks)] *= factor
+                system.velocity[dofs] *= factor
+                self.rigid_force[lists.dof[dofs]] *= factor
+            impulse[:] = whole * np.repeat(share[of_contact], 3)
 
     def _touched_rigid_bodies(self, count: int) -> np.ndarray:
         """Returns the MuJoCo bodies [k] that the first ``count`` contacts touch, each body once."""

@@ -38,7 +38,7 @@ class IslandSystem:
     impulse: wp.array(dtype=wp.float64)
     """[row] Present impulse along the row, N s."""
     impulse_first: wp.array(dtype=wp.float64)
-    """[row] Impulse before the first Newton step, N s."""
+    """[row] Impulse before the Newton steps that no sweep has tested yet, N s."""
     impulse_before: wp.array(dtype=wp.float64)
     """[row] Impulse before the last sweep, N s."""
     direction: wp.array(dtype=wp.float64)

@@ -104,9 +104,10 @@ def solve_island(
 
     Gauss-Seidel converges slowly if contacts depend strongly on each other, such as two fingers around a bunch. It
     finds the states of contacts (sticking, sliding, open) within a few sweeps, but takes a hundred sweeps for the
-    impulses. So islands of small blocks at first take a Newton step after every sweep. If these steps do not converge,
-    sweeps continue from the impulses before the first Newton step, with conjugate gradients. In islands with a large
-    block, conjugate gradients are used from the first sweep on.
+    impulses. So islands of small blocks at first take a Newton step after every sweep, then one in
+    :data:`NEWTON_PERIOD`, and conjugate gradients between. Newton steps may lead away from the solution. They are kept
+    only if the next sweep changes the impulses less than the sweep before the steps; otherwise sweeps continue from the
+    impulses before the steps. In islands with a large block, conjugate gradients are used from the first sweep on.
     """
     first = islands_out.row_start[islands_out.first_block[island]]
     last = islands_out.row_start[islands_out.first_block[island + 1]]
@@ -115,24 +116,60 @@ def solve_island(
         newton_end = 0
     sweeps = int(0)
     gradient = wp.float64(0.0)
+    change_first = wp.float64(0.0)
+    is_untested = bool(False)
     busy = bool(True)
     while busy and sweeps < max_sweeps:
         copy_rows(first, last, system_out.impulse, system_out.impulse_before)
         change, largest = sweep(island, islands_out, matrix, system_out)
         sweeps = sweeps + 1
         busy = change > tolerance * largest
-        if busy and sweeps < max_sweeps:
-            if sweeps == newton_end + 1 and newton_end > 0:
-                copy_rows(first, last, system_out.impulse_first, system_out.impulse)
-                update_rigid_velocity(island, islands_out, system_out)
-            elif sweeps > newton_end and (newton_end == 0 or sweeps % NEWTON_PERIOD != 0):
+        if busy and is_untested and sweeps > newton_end and change > change_first:
+            copy_rows(first, last, system_out.impulse_first, system_out.impulse)
+            update_rigid_velocity(island, islands_out, system_out)
+            is_untested = False
+        elif busy and sweeps < max_sweeps:
+            if sweeps > newton_end and (newton_end == 0 or sweeps % NEWTON_PERIOD != 0):
                 gradient = follow_conjugate_direction(island, first, last, gradient, islands_out, system_out)
+                is_untested = False
             else:
-                if sweeps == 1:
+                if not is_untested:
                     copy_rows(first, last, system_out.impulse, system_out.impulse_first)
+                    change_first = change
+                is_untested = True
                 gradient = wp.float64(0.0)
                 newton_step(island, islands_out, matrix, system_out)
+    if busy:
+        end_growth(island, islands_out, matrix, system_out)
     islands_out.sweeps[island] = sweeps
+
+
+@wp.func
+def end_growth(island: int, islands: Islands, matrix: wp.array(dtype=wp.float64), system_out: IslandSystem):
+    """Scale the impulses x of an island whose solve did not converge, so that they add no energy: x . r <= 0.
+
+    In a solution the residual velocities r are 0 along normals that press and opposite to friction, so a solution is
+    not changed. Impulses far from a solution can add any energy. Of the impulses s x with s from 0 to 1, which lie in
+    the same friction cones, the largest that add no energy have s = -x . r_0 / x . (r - r_0), where r_0 are the
+    residuals without impulses.
+    """
+    zero = wp.float64(0.0)
+    free = wp.float64(0.0)
+    own = wp.float64(0.0)
+    for block in range(islands.first_block[island], islands.first_block[island + 1]):
+        for place in range(islands.block_start[block], islands.block_start[block + 1]):
+            row = contact_row(place, block, islands)
+            x = three(row, system_out.impulse)
+            before = three(row, system_out.free)
+            free = free + wp.dot(x, before)
+            own = own + wp.dot(x, contact_residual(place, block, island, islands, matrix, system_out) - before)
+    if free + own > zero:
+        share = wp.max(zero, -free / own)
+        for row in range(
+            islands.row_start[islands.first_block[island]], islands.row_start[islands.first_block[island + 1]]
+        ):
+            system_out.impulse[row] = share * system_out.impulse[row]
+        update_rigid_velocity(island, islands, system_out)
 
 
 @wp.kernel
