@@ -337,6 +337,7 @@ def break_at_random(scene: str, count: int, seed: int, at_once: int = 24) -> Non
     # a fine shoot of cordon that 80 N pull through picked bunches and against its arm has up to 106 contacts
     physics = Physics(model, parameters=PhysicsParameters(max_contacts_per_tree=128))
     plants = physics.plants
+    contacts_of_trees = 0
     hooks: list[tuple[int, np.ndarray, int]] = []
     breaks = 0
     for step in range(40 * count):
@@ -367,6 +368,7 @@ def break_at_random(scene: str, count: int, seed: int, at_once: int = 24) -> Non
                 np.testing.assert_array_equal(plants.body_mass, mass)
                 assert np.abs(is_now.linear - was.linear).max() <= 2e-6 * speed.sum() + 1e-9, (step, torn)
         physics.tick += 1
+        contacts_of_trees = max(contacts_of_trees, int(physics.contact_solver.detection.candidates.count.max()))
         gone = {one.body for one in torn} | {int(model.bunch_body[one.bunch]) for one in torn if one.bunch >= 0}
         breaks += len(torn)
         here = hangs(physics)
@@ -378,7 +380,10 @@ def break_at_random(scene: str, count: int, seed: int, at_once: int = 24) -> Non
         physics.step()
     assert breaks >= count
     assert np.isfinite(physics.snapshot().body_q).all()
-    assert {name: n for name, n in physics.faults.items() if n and name != "trees_slowed"} == {}
+    assert contacts_of_trees < physics.parameters.max_contacts_per_tree
+    # 750 trees of vsp that are awake at once have up to 1064 contacts, and a world has room for 1024
+    faults = {name: n for name, n in physics.faults.items() if n}
+    assert faults.keys() <= {"trees_slowed", "contacts_dropped"}, faults
 
 
 def test_random_breaks_of_the_demo_keep_mass_and_momentum() -> None:
