@@ -82,7 +82,7 @@ def test_a_router_that_gets_no_processor_time_loses_no_record_of_a_loop_that_get
             wait(lambda: "bob" not in ada.bus.alive() and ada.bus.status_message, "ada's bus to lose bob")
         finally:
             os.kill(process.pid, signal.SIGCONT)
-        wait(running([bob], lambda: "ada" in bob.bus.alive()), "bob to hear of ada again")
+        wait(running([bob], lambda: "ada" in bob.bus.alive()), "bob to see ada again")
         wait(lambda: "bob" in ada.bus.alive() and not ada.bus.status_message, "ada's bus to be back")
         wait(running([ada, bob], lambda: ada.has(2) and bob.has(3)), "what both did meanwhile", 60.0)
         assert bob.bus.missed, "ada has left and come back"

@@ -132,9 +132,13 @@ class ClientArm:
 
 def _arm_state(robot: Any, device: Any, xpos: wp.array, xmat: wp.array, qpos: wp.array, qvel: wp.array) -> ArmState:
     state = ArmState()
-    state.tool_body, state.tool = robot.bodies[TOOL_LINK], wp.vec3(*TOOL)
+    state.tool_body = robot.bodies[TOOL_LINK]
+    state.tool = wp.vec3(*TOOL)
     state.q, state.v = (
         wp.array(index[: len(AXES)], dtype=wp.int32, device=device) for index in (robot.q, robot.v)
     )  # fmt: skip
-    state.xpos, state.xmat, state.qpos, state.qvel = xpos, xmat, qpos, qvel
+    state.xpos = xpos
+    state.xmat = xmat
+    state.qpos = qpos
+    state.qvel = qvel
     return state

@@ -57,8 +57,12 @@ class ExposeEnv(ArmEnv):
         worlds = self.worlds
         model = worlds.model
         numbers = kernels.ExposeNumbers()
-        numbers.eye, numbers.share, numbers.speed = wp.vec3(*EYE), SHARE, SPEED
-        numbers.success_reward, numbers.force_cost, numbers.action_cost = 10.0, 0.02, 0.01
+        numbers.eye = wp.vec3(*EYE)
+        numbers.share = SHARE
+        numbers.speed = SPEED
+        numbers.success_reward = 10.0
+        numbers.force_cost = 0.02
+        numbers.action_cost = 0.01
         arrays = self.arm_arrays
         given = [
             numbers,

@@ -114,9 +114,15 @@ class PickEnv(ArmEnv):
 
     def _numbers(self) -> kernels.PickNumbers:
         numbers = kernels.PickNumbers()
-        numbers.reach, numbers.lost, numbers.speed, numbers.actions = REACH, LOST, SPEED, HELD
-        numbers.cut_reward, numbers.success_reward = 2.0, 10.0
-        numbers.distance_cost, numbers.force_cost, numbers.action_cost = 1.0, 0.02, 0.01
+        numbers.reach = REACH
+        numbers.lost = LOST
+        numbers.speed = SPEED
+        numbers.actions = HELD
+        numbers.cut_reward = 2.0
+        numbers.success_reward = 10.0
+        numbers.distance_cost = 1.0
+        numbers.force_cost = 0.02
+        numbers.action_cost = 0.01
         return numbers
 
     def _places(self) -> kernels.BunchPlaces:
@@ -129,7 +135,11 @@ class PickEnv(ArmEnv):
         places.body, places.com, places.body_q = self.arm_arrays.bunches
         places.segment = self.on_device(worlds.plants.buffers.slots[segment], wp.int32)
         places.length = self.on_device(model.body_length[segment].astype(np.float32), float)
-        places.slots, places.free_body, places.free_v = pool.bunch, pool.table.body, pool.table.v
+        places.slots = pool.bunch
+        places.free_body = pool.table.body
+        places.free_v = pool.table.v
         data = worlds.bodies.data
-        places.xpos, places.xmat, places.qvel = data.xpos, data.xmat, data.qvel
+        places.xpos = data.xpos
+        places.xmat = data.xmat
+        places.qvel = data.qvel
         return places

@@ -66,8 +66,11 @@ def observe(arrays: ArmArrays, target: wp.array, action: wp.array, written: list
         written: observation [world, :data:`NUMBERS`], reward and success [world].
     """
     numbers = kernels.ReachNumbers()
-    numbers.reach, numbers.success_reward = REACH, 10.0
-    numbers.distance_cost, numbers.force_cost, numbers.action_cost = 1.0, 0.02, 0.01
+    numbers.reach = REACH
+    numbers.success_reward = 10.0
+    numbers.distance_cost = 1.0
+    numbers.force_cost = 0.02
+    numbers.action_cost = 0.01
     given = [numbers, arrays.arm, *arrays.bunches, arrays.worlds, target, action]
     given += [arrays.contacts, arrays.world_contacts]
     return KernelLaunch(kernels.observe, given, written, threads=arrays.worlds)
