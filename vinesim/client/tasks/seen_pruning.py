@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -419,10 +419,14 @@ class PruneBySight(PruneCanes):
         nearest = int(np.clip(np.linalg.norm(points - place, axis=1).argmin(), 1, len(points) - 2))
         return frames.pose(place, frames.from_x_axis(points[nearest + 1] - points[nearest - 1]))
 
-    def _wood_around(self, cut: WoodCut) -> Wood:
-        """Returns the remembered canes near the place of a cut. Of a cane that stays all counts as wood that stays: the
-        robot knows its buds too badly."""
+    def _plan(self, cut: WoodCut, tried: Sequence[np.ndarray] = ()) -> MouthPlace:
+        """Returns how the mouth takes a cane, among the canes that the robot remembers."""
         pose = self._pose(cut)
+        return self._place_of_mouth(cut, self._remembered_wood(cut, pose), tried)
+
+    def _remembered_wood(self, cut: WoodCut, pose: np.ndarray) -> Wood:
+        """Returns the remembered canes near the place ``pose`` [7] of a cut. Of a cane that stays all counts as wood
+        that stays: the robot knows its buds too badly."""
         points = []
         radius = []
         kind = []

@@ -18,8 +18,6 @@ from vinesim.scene.state import State
 
 TURNS = np.deg2rad(np.arange(-45.0, 46.0, 15.0))
 """[rad] Directions of the hand that are tried, against the direction across the row. GUESSED"""
-STRAIGHT = np.zeros(1)
-"""[rad] No other direction than the given one."""
 DEPTHS = np.array([-0.019, -0.010, 0.0, 0.010, 0.019])
 """[m] Distances of the cane ahead of the middle of the mouth that are tried; the mouth of 50 mm ends at 25 mm."""
 SIDES = np.linspace(-0.015, 0.015, 11)
@@ -127,38 +125,27 @@ def hand_shape(rigid: RigidWorld, robot: str, links: Sequence[str], mouth: np.nd
 
 
 def mouth_place(
-    wood: Wood,
-    hand: HandShape,
-    ahead: np.ndarray,
-    approach: float,
-    tried: Sequence[np.ndarray] = (),
-    turns: np.ndarray = TURNS,
+    wood: Wood, hand: HandShape, ahead: np.ndarray, approach: float, tried: Sequence[np.ndarray] = ()
 ) -> MouthPlace:
     """Returns the place with the least cost.
 
     ``ahead``: [3] usual direction of the hand, level; ``approach``: [m] length of the straight way to the cane;
-    ``tried``: directions [3] that have been in vain; ``turns``: [k] rad, turns from ``ahead`` that are tried.
+    ``tried``: directions [3] that have been in vain.
     """
-    best = _place_on(wood, hand, ahead, approach, tried, turns, 0.0)
+    best = _place_on(wood, hand, ahead, approach, tried, 0.0)
     if best[0] > ENOUGH:
-        others = [_place_on(wood, hand, ahead, approach, tried, turns, float(slide)) for slide in SLIDES[1:]]
+        others = [_place_on(wood, hand, ahead, approach, tried, float(slide)) for slide in SLIDES[1:]]
         best = min([best, *others], key=lambda one: one[0])
     return best[1]
 
 
 def _place_on(
-    wood: Wood,
-    hand: HandShape,
-    ahead: np.ndarray,
-    approach: float,
-    tried: Sequence[np.ndarray],
-    turns: np.ndarray,
-    slide: float,
+    wood: Wood, hand: HandShape, ahead: np.ndarray, approach: float, tried: Sequence[np.ndarray], slide: float
 ) -> tuple[float, MouthPlace]:
     """Returns the place with the least cost at ``slide`` [m] from the wanted place, and its whole cost."""
     up = np.array([0.0, 0.0, 1.0])
-    angles, depths, sides = (grid.ravel() for grid in np.meshgrid(turns, DEPTHS, SIDES, indexing="ij"))
-    cost = 5.0 * np.abs(angles) / TURNS[-1] + np.abs(depths) / DEPTHS[-1] + 4.0 * (sides / SIDES[-1]) ** 2
+    turns, depths, sides = (grid.ravel() for grid in np.meshgrid(TURNS, DEPTHS, SIDES, indexing="ij"))
+    cost = 5.0 * np.abs(turns) / TURNS[-1] + np.abs(depths) / DEPTHS[-1] + 4.0 * (sides / SIDES[-1]) ** 2
     cost += 4.0 * abs(slide) / SLIDES[-1]
     low = hand.middle - hand.half
     high = hand.middle + hand.half
@@ -174,7 +161,7 @@ def _place_on(
     touch_cost = TOUCH_COST[kind]
     catch_cost = np.where(own, 0.0, CATCH_COST[kind])
     goes = (kind == KINDS.index("goes")) & ~own
-    directions = frames.rotate(frames.from_yaw(turns), ahead)
+    directions = frames.rotate(frames.from_yaw(TURNS), ahead)
     added = np.zeros(len(cost))
     catches = np.zeros(len(cost), bool)
     each = len(DEPTHS) * len(SIDES)

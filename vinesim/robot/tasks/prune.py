@@ -19,7 +19,7 @@ from vinesim.robot.control.cartesian_controller import CartesianController, axes
 from vinesim.robot.control.waypoint_follower import WaypointFollower
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.drives.joint_servos import CommandError
-from vinesim.robot.tasks.mouth_place import ENOUGH, STRAIGHT, MouthPlace, Wood, WoodAround, hand_shape, mouth_place
+from vinesim.robot.tasks.mouth_place import ENOUGH, MouthPlace, Wood, WoodAround, hand_shape, mouth_place
 from vinesim.robot.tasks.task import Task, TaskFailed
 from vinesim.scene.values import Detachment
 from vinesim.world import Physics
@@ -36,11 +36,9 @@ MOUTH_MARGIN = 0.002
 """[m] Distance from the edge of the mouth that the wood must have then."""
 TURNED = 0.25
 """[rad] Error of the hand's orientation at which it makes the last part of the way."""
-SLOW = 0.015
-"""[m/s] Speed of the hand on the :data:`LAST_WAY` where there is little room beside the mouth. GUESSED: 0.15 mm in a
-step, after which a spur with a stiffness of 15 N/mm presses with 2 N."""
-EASING = 0.02
-"""[m/s] Speed of the hand that draws back from a bud. GUESSED"""
+SLOW = 0.03
+"""[m/s] Speed of the hand on the :data:`LAST_WAY` where there is little room beside the mouth. GUESSED: 0.3 mm in
+a step."""
 LAST_WAY = 0.05
 """[m] Length of the last part of the way, which begins when the hand has turned: the bars are beside the cane then."""
 TOUCH = 1.0
@@ -255,12 +253,10 @@ class PruneCanes(Task):
                 timeout=5.0,
                 near=IN_LINE,
             )
-            self._at = self._plan(cut, ahead=self._at.ahead)  # canes have moved
-            yield from self._move("advance", lambda: self._tip(cut), speed=self._speed(), timeout=8.0, near=REACHED)
+            yield from self._move("advance", lambda: self._tip(cut), speed=self._speed(), timeout=4.0, near=REACHED)
         except TaskFailed:
             if not self._is_in_mouth(cut):
                 raise
-            yield from self._ease(cut)
         blades = self.robot.cutter_blades(self.arm.gripper)
         for _ in range(MAX_CLOSURES):
             closed = [blade.closures for blade in blades]
@@ -277,35 +273,23 @@ class PruneCanes(Task):
             f"the blades did not cut the cane: its wood needs {strongest:.0f} N, 0: it is not in the mouth"
         )
 
-    def _ease(self, cut: WoodCut) -> Iterator[str]:
-        """Draw the hand back until it presses no bud that stays, as long as the wanted place is in the mouth."""
-        start = self.arm.tip_position
-        way = 0.0
-        while (self._bud_forces() > TOUCH).any() and self._is_in_mouth(cut):
-            way += EASING * self.physics.dt
-            there = start - way * self._at.ahead
-            self.arm.move_towards(there, self._at.ahead, DOWN, speed=EASING, working_height=float(there[2]))
-            yield "ease"
-
     def _reach(self, cut: WoodCut) -> Iterator[str]:
         """Bring the hand, turned, to the start of the straight motion towards the cane."""
         yield from self._move(
             "reach", lambda: self._tip(cut) - APPROACH * self._at.ahead, speed=0.35, timeout=4.0, near=IN_LINE
         )
 
-    def _plan(self, cut: WoodCut, tried: Sequence[np.ndarray] = (), ahead: np.ndarray | None = None) -> MouthPlace:
-        """Returns how the mouth takes a cane; ``ahead``: [3] the only direction that is considered."""
+    def _plan(self, cut: WoodCut, tried: Sequence[np.ndarray] = ()) -> MouthPlace:
+        """Returns how the mouth takes a cane, among the wood around it as it is now."""
+        wood = self._wood.around(self.physics.state, self._pose(cut), cut.cane, self._kept)
+        return self._place_of_mouth(cut, wood, tried)
+
+    def _place_of_mouth(self, cut: WoodCut, wood: Wood, tried: Sequence[np.ndarray]) -> MouthPlace:
+        """Returns how the mouth takes a cane among other ``wood``."""
         link, offset = self._mouth_pose
         mouth = frames.compose(self.robot.frame_pose(link), offset)
         hand = hand_shape(self.robot.rigid, self.robot.name, self._hand_links, mouth, self._half)
-        wood = self._wood_around(cut)
-        if ahead is not None:
-            return mouth_place(wood, hand, ahead, APPROACH, turns=STRAIGHT)
         return mouth_place(wood, hand, cut.ahead, APPROACH, tried)
-
-    def _wood_around(self, cut: WoodCut) -> Wood:
-        """Returns the wood around a cut as it is now."""
-        return self._wood.around(self.physics.state, self._pose(cut), cut.cane, self._kept)
 
     def _withdraw(self) -> Iterator[str]:
         """Draw the hand back the way it came; a hand that is held stays where it is."""
