@@ -42,8 +42,8 @@ a step."""
 LAST_WAY = 0.05
 """[m] Length of the last part of the way, which begins when the hand has turned: the bars are beside the cane then."""
 TOUCH = 1.0
-"""[N] Rise of the force on a bud that stays at which the hand stops, whether the hand or a cane that it pushes presses
-the bud."""
+"""[N] Rise of its force on a bud that stays at which the hand stops. Forces of other canes do not count: canes press
+each other by more where they cross, and these forces never rest."""
 IN_LINE = 0.008
 """[m] Distance from its start at which the straight motion towards the cane begins."""
 MAX_CLOSURES = 3
@@ -319,7 +319,7 @@ class PruneCanes(Task):
         """Move the hand to ``goal`` [3] m in the world with its blades down."""
         end = self.time + timeout
         self.arm.reset()
-        at_rest = self._bud_forces()  # canes lie on each other and on wires
+        at_rest = self._bud_forces()  # a hand that is held may press a bud already
         while True:
             there = goal()
             axes = axes_of_pose(self.robot.frame_pose(self.arm.tool))
@@ -353,9 +353,9 @@ class PruneCanes(Task):
         return np.concatenate(found)
 
     def _bud_forces(self) -> np.ndarray:
-        """Returns the force [k] N on each bud that stays, in the last step."""
+        """Returns the force [k] N of the robot on each bud that stays, in the last step."""
         physics = self.physics
-        touching = [one for one in physics.contacts if one.body >= 0]
+        touching = [one for one in physics.contacts if one.actor == self.robot.name]
         if not touching or not len(self._kept_buds):
             return np.zeros(len(self._kept_buds))
         return bud_forces(physics.model, physics.state, touching)[self._kept_buds]
