@@ -6,7 +6,7 @@ import warp as wp
 from vinesim.kernels.contact.body_motion import to_double
 from vinesim.kernels.contact.distance import segment_segment_distance
 from vinesim.kernels.contact.structs import Capsules, Contacts
-from vinesim.kernels.learn.reach import ArmState, bunch_middle, observe_arm
+from vinesim.kernels.learn.reach import ArmState, bunch_middle, observe_arm, squared_action
 from vinesim.kernels.worlds.narrowphase import WorldContacts
 
 wp.set_module_options({"enable_backward": False})
@@ -117,9 +117,7 @@ def observe(
             force = force + float(wp.length(contacts.force[at]))
     observation_out[world, place] = share
     observation_out[world, place + 1] = force
-    effort = float(0.0)
-    for i in range(action.shape[1]):
-        effort = effort + action[world, i] * action[world, i]
+    effort = squared_action(world, action)
     front = bunch[worlds + world]
     motion = body_qd[front]
     success = share >= numbers.share and wp.length(wp.spatial_top(motion)) < numbers.speed

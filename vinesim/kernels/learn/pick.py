@@ -4,7 +4,7 @@ batch's device."""
 import warp as wp
 
 from vinesim.kernels.contact.structs import Contacts
-from vinesim.kernels.learn.reach import ArmState, bunch_middle, observe_arm
+from vinesim.kernels.learn.reach import ArmState, bunch_middle, force_on_others, observe_arm, squared_action
 from vinesim.kernels.worlds.narrowphase import WorldContacts
 
 wp.set_module_options({"enable_backward": False})
@@ -221,17 +221,11 @@ def observe(
             for k in range(3):
                 observation_out[world, place + k] = offset[k]
             place = place + 3
-    force = float(0.0)
-    for c in range(world_contacts.count[world]):
-        at = c * worlds + world
-        if world_contacts.tree[at] / worlds != wanted:
-            force = force + float(wp.length(contacts.force[at]))
+    force = force_on_others(world, worlds, wanted, contacts, world_contacts)
     observation_out[world, place] = force
     for k in range(trees):
         observation_out[world, place + 1 + k] = wp.where(k == wanted, 1.0, 0.0)
-    effort = float(0.0)
-    for i in range(action.shape[1]):
-        effort = effort + action[world, i] * action[world, i]
+    effort = squared_action(world, action)
     reward = -numbers.distance_cost * wp.length(to_stalk) - numbers.force_cost * force - numbers.action_cost * effort
     if since[world] == 1:
         reward = reward + numbers.cut_reward

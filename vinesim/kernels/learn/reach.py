@@ -58,6 +58,26 @@ def bunch_middle(body_q: wp.array(dtype=wp.transform), body: int, com: wp.vec3):
     return wp.transform_point(body_q[body], com)
 
 
+@wp.func
+def force_on_others(world: int, worlds: int, wanted: int, contacts: Contacts, world_contacts: WorldContacts):
+    """Returns the sum of the contact forces [N] on the trees of a world except its tree number ``wanted``."""
+    force = float(0.0)
+    for c in range(world_contacts.count[world]):
+        at = c * worlds + world
+        if world_contacts.tree[at] / worlds != wanted:
+            force = force + float(wp.length(contacts.force[at]))
+    return force
+
+
+@wp.func
+def squared_action(world: int, action: wp.array2d(dtype=float)):
+    """Returns the sum of the squared components of a world's action."""
+    effort = float(0.0)
+    for i in range(action.shape[1]):
+        effort = effort + action[world, i] * action[world, i]
+    return effort
+
+
 @wp.kernel
 def observe(
     # model
@@ -102,17 +122,11 @@ def observe(
             for k in range(3):
                 observation_out[world, place + k] = offset[k]
             place = place + 3
-    force = float(0.0)
-    for c in range(world_contacts.count[world]):
-        at = c * worlds + world
-        if world_contacts.tree[at] / worlds != wanted:
-            force = force + float(wp.length(contacts.force[at]))
+    force = force_on_others(world, worlds, wanted, contacts, world_contacts)
     observation_out[world, place] = force
     for k in range(trees):
         observation_out[world, place + 1 + k] = wp.where(k == wanted, 1.0, 0.0)
-    effort = float(0.0)
-    for i in range(action.shape[1]):
-        effort = effort + action[world, i] * action[world, i]
+    effort = squared_action(world, action)
     success = distance < numbers.reach
     reward = -numbers.distance_cost * distance - numbers.force_cost * force - numbers.action_cost * effort
     if success:

@@ -33,7 +33,7 @@ class PoolNumbers:
     dofs: int
     """Degrees of freedom of a world."""
     stub_mass: float
-    """[kg] Mass of what stays on the vine in place of a bunch."""
+    """[kg] Mass of the stub of the peduncle that stays on the vine in place of a bunch."""
     ghost_share: float
     """Share of its mass that a segment of stalk keeps on the vine."""
     shortest: wp.float64
