@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import pytest
 import warp as wp
 
 from vinesim.core.warp_arrays import share
-from vinesim.kernels.graph import TIERS, KernelGraph, KernelLaunch, tier_of
+from vinesim.kernels.graph import TIERS, ForeignLaunches, KernelGraph, KernelLaunch, outside_captures, tier_of
 
 
 @wp.kernel(enable_backward=False)
@@ -105,3 +107,44 @@ def test_tiers_hold_what_is_asked_for() -> None:
     assert [tier_of(n) for n in (0, 1, TIERS[0], TIERS[0] + 1)] == [first, first, first, second]
     with pytest.raises(ValueError, match="4194305 items in one launch; the largest number is 4194304"):
         tier_of(TIERS[-1] + 1)
+
+
+def test_what_another_thread_launches_during_a_capture_runs_once_and_is_no_part_of_the_graph() -> None:
+    mine, theirs = np.zeros(4, np.int32), np.zeros(4, np.int32)
+    count, entries = ints(np.array([4], np.int32)), ints(np.arange(4, dtype=np.int32))
+
+    def launch() -> None:
+        with outside_captures():
+            wp.launch(count_visits, 4, inputs=[count, entries], outputs=[ints(theirs)], device="cpu")
+
+    other = threading.Thread(target=launch)
+
+    def start_the_other() -> None:
+        other.start()
+        other.join(0.2)
+
+    sequence = KernelGraph(ForeignLaunches(start_the_other), KernelLaunch(count_visits, [count, entries], [ints(mine)]))
+    sequence(4)
+    other.join()
+    for _ in range(2):
+        sequence(4)
+    assert theirs.tolist() == [1] * 4
+    assert mine.tolist() == [3] * 4
+
+
+def test_a_sequence_runs_while_another_thread_launches_and_is_captured_later() -> None:
+    visits, captures = np.zeros(4, np.int32), []
+    count, entries = ints(np.array([4], np.int32)), ints(np.arange(4, dtype=np.int32))
+    sequence = KernelGraph(
+        ForeignLaunches(lambda: captures.append(wp.get_device("cpu").is_capturing)),
+        KernelLaunch(count_visits, [count, entries], [ints(visits)]),
+    )
+    with outside_captures():
+        sequence(4)
+        sequence(3)
+    assert captures == [False, False]
+    assert visits.tolist() == [2] * 4
+    for _ in range(3):
+        sequence(4)
+    assert captures == [False, False, True]
+    assert visits.tolist() == [5] * 4

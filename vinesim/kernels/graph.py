@@ -13,9 +13,10 @@ each number of threads in :data:`TIERS`.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
 
 import warp as wp
@@ -32,11 +33,10 @@ THREADS_PER_BLOCK = 32
 One thread simulates one tree and runs long; small blocks spread few trees over all multiprocessors.
 """
 
-_capturing = threading.Lock()
-"""Lock of graph captures, because Warp can capture only one graph at a time.
-
-No other thread may call ``wp.launch`` during a capture, because that would write to a table of the captured graph.
-"""
+_changed = threading.Condition()
+"""Lock of :data:`_users`; it is notified at the end of a capture."""
+_users = {"captures": 0, "launches": 0}
+"""Number of threads that capture a graph (at most one), and number of calls of :func:`outside_captures` in progress."""
 
 
 class Launchable(Protocol):
@@ -95,28 +95,68 @@ class KernelGraph:
     def __call__(self, capacity: int = 1) -> None:
         """Run the launches in order; the numbers of items that their kernels read must not exceed ``capacity``.
 
-        On CUDA the call returns when the launches are queued. If the caller is capturing a graph, the launches become
+        The first call for a number of threads captures the graph; while another thread uses Warp, the call launches
+        the kernels one by one instead. On CUDA the call returns when the launches are queued. If the caller is capturing a graph, the launches become
         part of it.
         """
         if self._is_cuda and self._device.is_capturing:
             self._launch(tier_of(capacity).stop - 1)
             return
-        if capacity not in self._room:
-            self._choose(tier_of(capacity))
-        wp.capture_launch(self._graph)
+        if capacity in self._room or self._choose(tier_of(capacity)):
+            wp.capture_launch(self._graph)
+            return
+        with outside_captures():
+            self._launch(tier_of(capacity).stop - 1)
 
     def _launch(self, items: int) -> None:
         for launch in self._launches:
             launch.launch(items, self._device)
 
-    def _choose(self, tier: range) -> None:
+    def _choose(self, tier: range) -> bool:
+        """Whether there is now a graph for ``tier``, which later calls use; not if another thread uses Warp."""
         most = tier.stop - 1
         if most not in self._graphs:
-            with _capturing, wp.ScopedCapture(self._device) as capture:
-                self._launch(most)
+            with _begin_capture() as may_capture:
+                if not may_capture:
+                    return False
+                with wp.ScopedCapture(self._device) as capture:
+                    self._launch(most)
             self._graphs[most] = capture.graph
         self._graph = self._graphs[most]
         self._room = tier
+        return True
+
+
+@contextlib.contextmanager
+def outside_captures() -> Iterator[None]:
+    """Context, also a decorator, in which a thread may call Warp while another thread may call a :class:`KernelGraph`.
+
+    Warp captures for the whole process: a launch or a copy of any thread would become part of the graph that another
+    thread captures, and would not run. So the context waits for the end of a capture [ms], and none begins before its
+    own end.
+    """
+    with _changed:
+        _changed.wait_for(lambda: not _users["captures"])
+        _users["launches"] += 1
+    try:
+        yield
+    finally:
+        with _changed:
+            _users["launches"] -= 1
+
+
+@contextlib.contextmanager
+def _begin_capture() -> Iterator[bool]:
+    """Context of a capture; its value is False if another thread captures or launches now, and this one may not."""
+    with _changed:
+        is_free = not any(_users.values())
+        _users["captures"] += is_free
+    try:
+        yield is_free
+    finally:
+        with _changed:
+            _users["captures"] -= is_free
+            _changed.notify_all()
 
 
 def tier_of(capacity: int) -> range:

@@ -18,6 +18,7 @@ import warp as wp
 
 from vinesim.core import frames
 from vinesim.core.thread_pool import MAX_THREADS, ThreadPool, usable_cores
+from vinesim.kernels.graph import outside_captures
 from vinesim.kernels.raster import camera_raster, camera_raster_plants
 from vinesim.kernels.raster.pinhole import Pinhole
 from vinesim.kernels.shading import colour_response, deferred, light_plants, light_points, shadow_maps, tone_rows
@@ -275,6 +276,7 @@ class Camera:
             frame = dataclasses.replace(frame, bunches=bunches)
         return frame
 
+    @outside_captures()
     def render(
         self,
         primitives: Primitives,
@@ -438,6 +440,7 @@ class Camera:
             copies.append(np.zeros(0, np.float32) if array is None else self._host_buffers[i].numpy().copy())
         return copies
 
+    @outside_captures()
     def render_on_device(
         self,
         primitives: Primitives,

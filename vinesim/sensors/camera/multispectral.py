@@ -18,6 +18,7 @@ import warp as wp
 
 from vinesim.core import frames
 from vinesim.core.thread_pool import MAX_THREADS, ThreadPool, usable_cores
+from vinesim.kernels.graph import outside_captures
 from vinesim.kernels.raster.pinhole import Pinhole
 from vinesim.kernels.shading import illumination, materials
 from vinesim.kernels.shading.shadow_maps import ShadowMap
@@ -206,6 +207,7 @@ class MultispectralCamera:
         """Render a frame as :class:`vinesim.sensors.sensor.Sensor` defines it; the frame always has all bands."""
         return self.render(primitives, pose, snapshot.time)
 
+    @outside_captures()
     def render(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> MultispectralFrame:
         """Render a frame from ``pose`` [7], the pose of the optical frame in the world, at simulated ``time`` [s]."""
         if self._device == "cpu":

@@ -22,6 +22,7 @@ import warp as wp
 
 from vinesim.core import frames
 from vinesim.core.thread_pool import MAX_THREADS, ThreadPool, usable_cores
+from vinesim.kernels.graph import outside_captures
 from vinesim.kernels.lidar import lidar_echoes, lidar_raster
 from vinesim.scene.ids import PARTS_OF_CANE, Organ, label
 from vinesim.scene.plant_parameters import Number
@@ -303,6 +304,7 @@ class Lidar:
         """Revolutions per second [Hz]."""
         return self.spec.rate.value
 
+    @outside_captures()
     def scan(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> LidarScan:
         """Compute one revolution from ``pose`` [7] of the lidar in the world (x forward, z up), in a world that stands
         still, with ``time`` [s] as the time of the first firing."""
@@ -330,6 +332,7 @@ class Lidar:
         )
         self._noise.assign(noise)
 
+    @outside_captures()
     def fire(self, primitives: Primitives, first: int, poses: np.ndarray) -> None:
         """Compute the firings from index ``first`` on, one for each pose in ``poses`` [firing, 7] of the lidar."""
         poses = np.array(poses, float)

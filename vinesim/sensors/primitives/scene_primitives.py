@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.core import disk_cache, frames
+from vinesim.kernels.graph import outside_captures
 from vinesim.kernels.raster import ground, primitives, transform_primitives
 from vinesim.kernels.shading import materials
 from vinesim.scene import berries
@@ -89,6 +90,7 @@ class Primitives:
     """All primitives of a vineyard and its actors, posed in the world (see
     :mod:`vinesim.kernels.raster.primitives`)."""
 
+    @outside_captures()
     def __init__(
         self,
         model: Model,
@@ -587,6 +589,7 @@ class Primitives:
 
     # -- following the world
 
+    @outside_captures()
     def update(self, snapshot: Snapshot, moved: np.ndarray | None = None) -> np.ndarray:
         """Move the primitives to the poses of ``snapshot``, and return the clusters [k] (runs of primitives) that
         moved.
