@@ -20,7 +20,7 @@ from vinesim.kernels.contact.friction_law import (
     steps_of,
 )
 from vinesim.kernels.worlds import contact_step
-from vinesim.kernels.worlds.dense_solver import WorldSearch, WorldSystem, solve_world, update_velocities
+from vinesim.kernels.worlds.dense_solver import WorldSearch, WorldSystem, end_growth, solve_world, update_velocities
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.world import Physics
 
@@ -90,6 +90,46 @@ def test_batches_and_islands_find_the_same_impulses() -> None:
             sliding += int((share > 0.999).sum())
             sticking += int((share < 0.999).sum())
     assert min(open_ones, sliding, sticking) > 5
+
+
+@wp.kernel
+def stop_early(count: int, system: WorldSystem, search: WorldSearch):
+    update_velocities(0, 1, 3 * count, system)
+    _sweeps, busy = solve_world(0, 0, 1, count, 2, NEWTON_STEPS, wp.float64(TOLERANCE), system, search)
+    if busy:
+        end_growth(0, 1, 3 * count, system)
+
+
+def test_impulses_of_a_batch_that_did_not_converge_add_no_energy() -> None:
+    """The work of the impulses x with the velocities r that they leave, compliance included, is x . r <= 0, also from a
+    first guess far from the solution, while impulses stay in their friction cones."""
+    rng = np.random.default_rng(1)
+    scaled = 0
+    for _ in range(50):
+        count = int(rng.integers(2, 6))
+        rows = 3 * count
+        responses = rng.normal(size=(rows, 4)) * rng.lognormal(0.0, 2.0, (rows, 1))
+        matrix = (responses @ responses.T + 0.01 * np.eye(rows)).astype(np.float32).astype(float)
+        free = rng.normal(size=rows)
+        guess = np.abs(rng.normal(size=rows)) * (np.arange(rows) % 3 == 0)
+        surface = zeros(Surface, (count,))
+        surface["friction"] = 0.5
+        surface["compliance"] = 1e-3
+        system = SharedArrays.zeros(
+            WorldSystem, rows, matrix=matrix.astype(np.float32), free=free, surface=surface, impulse=guess
+        )
+        search = SharedArrays.zeros(WorldSearch, rows, factor=np.zeros((rows, rows + 1)))
+        wp.launch(stop_early, 1, [count, system.struct, search.struct], device="cpu")
+        x = system.impulse
+        residual = free + matrix @ x
+        np.testing.assert_allclose(system.velocity, residual, atol=1e-9 * np.abs(matrix).max())
+        work = x @ (residual + 1e-3 * x)
+        size = np.abs(x) @ np.abs(residual)
+        assert work <= 1e-9 * size
+        normal, *friction = x.reshape(-1, 3).T
+        assert (np.hypot(*friction) <= 0.5 * normal + 1e-12).all()
+        scaled += int(abs(work) <= 1e-9 * size and size > 0.0)
+    assert scaled > 5
 
 
 @wp.kernel

@@ -44,6 +44,7 @@ from vinesim.kernels.worlds.dense_solver import (
     WorldSearch,
     WorldSystem,
     copy_rows,
+    end_growth,
     solve_world,
     synchronize_lanes,
     update_velocities,
@@ -298,6 +299,8 @@ def begin_worlds(
         world_contacts_out.sweeps[world] = sweeps
         if busy and sweeps < max_sweeps:
             world_contacts_out.busy[wp.atomic_add(world_contacts_out.busy_count, 0, 1)] = world
+        elif busy:
+            end_growth(0, 1, 3 * count, system)
 
 
 @wp.kernel(cuda_max_registers=128)
@@ -374,7 +377,9 @@ def solve_busy_worlds(
                 update_velocities(lane, lanes, 3 * count, dense)
             copy_rows(lane, lanes, 3 * count, dense.impulse, search.before)
             copy_rows(lane, lanes, 3 * count, dense.impulse, search.first)
-            sweeps, _busy = solve_world(sweeps, lane, lanes, count, max_sweeps, newton_end, tolerance, dense, search)
+            sweeps, busy = solve_world(sweeps, lane, lanes, count, max_sweeps, newton_end, tolerance, dense, search)
+            if busy:
+                end_growth(lane, lanes, 3 * count, dense)
             copy_rows(lane, lanes, 3 * count, dense.impulse, system.impulse)
             copy_rows(lane, lanes, 3 * count, dense.velocity, system.velocity)
         if lane == 0:

@@ -372,3 +372,25 @@ def solve_world(
         busy = sweep_contacts(lane, lanes, count, tolerance, system_out)
         sweeps = sweeps + 1
     return sweeps, busy
+
+
+@wp.func
+def end_growth(lane: int, lanes: int, size: int, system_out: WorldSystem):
+    """Scale the impulses of a world whose solve did not converge, so that they add no energy.
+
+    See :func:`vinesim.kernels.contact.projected_gauss_seidel.end_growth`.
+    """
+    free = wp.float64(0.0)
+    own = wp.float64(0.0)
+    for row in range(size):
+        x = system_out.impulse[row]
+        before = system_out.free[row]
+        free = free + x * before
+        own = own + x * (system_out.surface[row // 3].compliance * x + system_out.velocity[row] - before)
+    synchronize_lanes(lanes)
+    if free + own > wp.float64(0.0):
+        share = wp.max(wp.float64(0.0), -free / own)
+        for row in range(lane, size, lanes):
+            system_out.impulse[row] = share * system_out.impulse[row]
+        synchronize_lanes(lanes)
+        update_velocities(lane, lanes, size, system_out)

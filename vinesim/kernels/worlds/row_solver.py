@@ -164,7 +164,7 @@ return right * by_pivot;
 """
 
 
-def row_solver(rows: int, lanes: int) -> Any:  # noqa: PLR0915 (it holds eight functions)
+def row_solver(rows: int, lanes: int) -> Any:  # noqa: PLR0915 (it holds nine functions)
     """Returns a Warp function that solves a world of at most ``rows`` rows with ``lanes`` threads of a GPU, 16 or 32."""
     Column = wp.types.vector(length=rows, dtype=wp.float32)
 
@@ -301,6 +301,19 @@ def row_solver(rows: int, lanes: int) -> Any:  # noqa: PLR0915 (it holds eight f
         return x, v, change, normal
 
     @func
+    def without_growth(ends: bool, x: wp.float64, v: wp.float64, outside: wp.float64, compliance: wp.float64):
+        """Returns the impulse and the velocity along a thread's row, scaled in worlds whose search ``ends`` before it
+        has converged. See :func:`vinesim.kernels.worlds.dense_solver.end_growth`."""
+        if not any_of_warp(ends):
+            return x, v
+        free = sum_of_lanes(x * outside, lanes)
+        own = sum_of_lanes(x * (compliance * x + v - outside), lanes)
+        share = wp.float64(1.0)
+        if ends and free + own > wp.float64(0.0):
+            share = wp.max(wp.float64(0.0), -free / own)
+        return share * x, outside + share * (v - outside)
+
+    @func
     def solve_rows(
         lane: int,
         count: int,
@@ -360,6 +373,7 @@ def row_solver(rows: int, lanes: int) -> Any:  # noqa: PLR0915 (it holds eight f
                 change > tolerance * largest, lane, lanes
             )  # all threads call this, also of finished worlds
             busy = busy and changing != wp.uint32(0)
+        x, v = without_growth(busy, x, v, outside, surface.compliance)
         if is_row:
             system_out.impulse[lane] = x
             system_out.velocity[lane] = v
