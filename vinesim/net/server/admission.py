@@ -131,11 +131,11 @@ class AdmissionControl:
         """Whether any actor is live in a world."""
         return any(there == world for there, _ in self._alive) or any(there == world for there, _ in self._admitted)
 
-    def claimant(self, world: str, name: str) -> str:
-        """Returns the session that holds a liveliness token of a name; :data:`SEVERAL` if several do, empty if none
-        does."""
-        live = self._alive.get((world, name), set())
-        return SEVERAL if len(live) > 1 else "".join(live)
+    def reserved_by(self, world: str, name: str, now: float) -> str:
+        """Returns the session that holds a name: the admitted one, else, until :attr:`reserved_until`, the live one
+        (:data:`SEVERAL` if there are several); empty if there is none. ``now`` [s]: time of the monotonic clock."""
+        live = self._alive.get((world, name), set()) if now < self.reserved_until else set()
+        return self.holder(world, name) or (SEVERAL if len(live) > 1 else "".join(live))
 
     def holder(self, world: str, name: str) -> str:
         """Returns the session that was admitted with a name; empty if there is none."""

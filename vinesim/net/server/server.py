@@ -584,10 +584,7 @@ class Server:
                 self._count_malformed(key[:200], MessageError("the query names no actor"))
                 return
             with self._lock:
-                holder = self._admission.holder(world, name)
-                counts_claims = "claimed" in query.parameters or time.monotonic() < self._admission.reserved_until
-                if not holder and counts_claims:
-                    holder = self._admission.claimant(world, name)
+                holder = self._admission.reserved_by(world, name, time.monotonic())
             query.reply(str(query.key_expr), holder.encode())
 
     def _on_snapshot_query(self, query: zenoh.Query) -> None:

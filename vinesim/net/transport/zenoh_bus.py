@@ -317,13 +317,10 @@ class ZenohBus:
             if holder := self._holder(name):
                 self._names.prefer(name, holder)
 
-    def _holder(self, name: str, *, claimed: bool = False) -> str | None:
-        """Returns the session that the server admitted with a name; empty if it admitted none, None without a server.
-
-        ``claimed``: whether a session that only declared a liveliness token counts as well.
-        """
-        selector = f"{self._prefix}holder/{name}" + ("?claimed" if claimed else "")
-        replies = self._session.get(selector, timeout=CONNECT_TIMEOUT)
+    def _holder(self, name: str) -> str | None:
+        """Returns the session that the server admitted with a name; empty if it admitted none, None without a
+        server."""
+        replies = self._session.get(f"{self._prefix}holder/{name}", timeout=CONNECT_TIMEOUT)
         found = [
             reply.ok.payload.to_string()
             for reply in replies
@@ -404,24 +401,25 @@ class ZenohBus:
         )
 
     def _claim_name(self) -> zenoh.LivelinessToken:
-        """Declare the liveliness token of this actor's name. Raises :class:`NameTaken` if another session holds it.
+        """Declare the liveliness token of this actor's name. Raises :class:`NameTaken` if another session holds it: by
+        a token, unless the server says that no session joined with the name.
 
         After the declaration this is checked again. If two sessions declare the name at once, the later one finds the
         token of the earlier one and leaves. If both read the tokens after both declarations, both leave.
         """
         mine = str(self._session.zid())
-        self._check_name(mine, "")
+        self._check_name(mine)
         token = self._session.liveliness().declare_token(f"{self._prefix}live/{self.name}/{mine}")
-        self._check_name(mine, mine)
+        self._check_name(mine)
         return token
 
-    def _check_name(self, mine: str, expected: str) -> None:
+    def _check_name(self, mine: str) -> None:
         """Raise :class:`NameTaken` if another session than ``mine`` holds this actor's name.
 
         The server is asked first, because a router of Zenoh 1.10 keeps some kB of each key that was ever asked for
-        tokens, for good. The tokens are read if the server does not name the ``expected`` session.
+        tokens, for good.
         """
-        if self._holder(self.name, claimed=True) == expected:
+        if self._holder(self.name) in ("", mine):
             return
         replies = self._session.liveliness().get(f"{self._prefix}live/{self.name}/*", timeout=CONNECT_TIMEOUT)
         if {_token(reply.ok.key_expr)[1] for reply in replies if reply.ok is not None} - {mine}:
