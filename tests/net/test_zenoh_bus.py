@@ -18,13 +18,13 @@ import zenoh
 from tests.support import programs
 from tests.support.waiting import deadline, wait
 from vinesim.core import frames
-from vinesim.net.codec.control import Hello
+from vinesim.net.codec.control import Hello, encode_hello
 from vinesim.net.codec.header import MAX_MESSAGE
 from vinesim.net.replication.replicator import Replicator
 from vinesim.net.server.server import Server
 from vinesim.net.transport import zenoh_bus, zenoh_session
 from vinesim.net.transport import zenoh_bus as zenoh_entities
-from vinesim.net.transport.bus import KEEP_ALL, NameTaken
+from vinesim.net.transport.bus import KEEP_ALL, JoinRejected, NameTaken
 from vinesim.net.transport.certificates import create
 from vinesim.net.transport.endpoints import parse, resolve_ports
 from vinesim.net.transport.zenoh_bus import ZenohBus
@@ -161,23 +161,36 @@ def test_counted_payload_bytes_equal_the_traffic(server):
         assert bob.seal_bytes_in == ada.seal_bytes_out < 50 * 80
 
 
+def joined(name: str, server: Server, world: str = "vineyard") -> ZenohBus:
+    """Returns the bus of an actor whom the server has admitted, so that no other session can have the name."""
+    bus = ZenohBus(name, connect=server.endpoint, world=world)
+    try:
+        bus.join(encode_hello(Hello(name, digest="D")))
+    except BaseException:
+        bus.close()
+        raise
+    return bus
+
+
 def test_a_name_is_live_once_and_free_after_leaving(server):
-    with ZenohBus("ada", connect=server.endpoint):
+    with joined("ada", server):
         with pytest.raises(NameTaken, match="'ada' is already live in world 'vineyard'"):
             ZenohBus("ada", connect=server.endpoint)
-        with ZenohBus("ada", connect=server.endpoint, world="other") as elsewhere:
+        with joined("ada", server, "other") as elsewhere:
             assert elsewhere.alive() == {"ada"}
-    with ZenohBus("ada", connect=server.endpoint) as reset:
+    with joined("ada", server) as reset:
         assert reset.alive() == {"ada"}
 
 
-def test_at_most_one_of_simultaneous_joins_keeps_the_name(server):
+def test_at_most_one_of_simultaneous_joins_keeps_the_name(server, monkeypatch):
+    """Also when the server no longer reserves names for sessions that were there before it started."""
+    monkeypatch.setattr(server._admission, "reserved_until", 0.0)
     outcomes: list[object] = []
 
     def join() -> None:
         try:
-            outcomes.append(ZenohBus("ada", connect=server.endpoint))
-        except NameTaken as error:
+            outcomes.append(joined("ada", server))
+        except (NameTaken, JoinRejected) as error:
             outcomes.append(error)
 
     threads = [threading.Thread(target=join) for _ in range(4)]
@@ -185,7 +198,7 @@ def test_at_most_one_of_simultaneous_joins_keeps_the_name(server):
         thread.start()
     for thread in threads:
         thread.join()
-    buses = [socket_ for socket_ in outcomes if isinstance(socket_, ZenohBus)]
+    buses = [outcome for outcome in outcomes if isinstance(outcome, ZenohBus)]
     for bus in buses:
         bus.close()
     assert len(outcomes) == 4
