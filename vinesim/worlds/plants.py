@@ -29,7 +29,7 @@ def plants_of_worlds(models: Sequence[Model], count: int) -> Model:
         other = len(models[odd[0]].tree_first)
         raise ValueError(f"model {odd[0]} has {other} trees, model 0 has {trees}: all worlds need as many trees")
     first = np.cumsum([0, *(len(model.tree_first) for model in models[:-1])])
-    return _gathered(joined(models), (np.arange(trees)[:, None] + first[np.arange(count) % len(models)]).ravel())
+    return gathered(joined(models), (np.arange(trees)[:, None] + first[np.arange(count) % len(models)]).ravel())
 
 
 def joined(models: Sequence[Model]) -> Model:
@@ -59,8 +59,8 @@ def joined(models: Sequence[Model]) -> Model:
     return whole
 
 
-def _gathered(pool: Model, trees: np.ndarray) -> Model:
-    """Returns a model with the trees [k] of another one, which may repeat."""
+def gathered(pool: Model, trees: np.ndarray) -> Model:
+    """Returns a model with the ``trees`` [k] of another one, which may repeat."""
     size = pool.tree_size[trees]
     first = np.cumsum(size) - size
     shift = first - pool.tree_first[trees]
