@@ -41,8 +41,9 @@ LARGEST = 1024
 """[px] Largest width and height of a picture."""
 _COPIED = ("leaf_texture", "noise_texture", "soil_texture", "rows", "colours", "ground")
 """Fields of ``Materials`` that all worlds share."""
-_OPEN = 1e4
-"""[m] Width of the square in which the ground sees the whole sky."""
+_OPEN = 40.0
+"""[m] Width of the square around the origin that is the floor of a vineyard; beyond it are fields. GUESSED. One
+world must look the same in any batch, so the square does not follow the plants."""
 _BLOCKS = (64, 128)
 """Numbers of threads in a CUDA block: of those that pose clusters, and of those that draw pixels."""
 
