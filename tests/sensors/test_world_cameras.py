@@ -174,6 +174,25 @@ def test_only_the_wanted_pictures_are_drawn() -> None:
     assert labels[1].any()
 
 
+def test_a_world_that_explodes_keeps_its_pictures_and_the_others_do_not_notice() -> None:
+    drawn = []
+    for explode in (False, True):
+        worlds = shoot_worlds([1, 2, 3])
+        cameras = WorldCameras(worlds, [FIXED, ON_HAND], SIZE)
+        cameras.render()
+        assert cameras.rgb is not None
+        before = cameras.rgb.numpy()[1].copy()
+        if explode:
+            rates = worlds.bodies.data.qvel.numpy()
+            rates[1, 4] = np.nan
+            worlds.bodies.data.qvel.assign(rates)
+        worlds.step(4)
+        cameras.render()
+        drawn.append(cameras.rgb.numpy().copy())
+        assert (before == drawn[-1][1]).all() == explode
+    np.testing.assert_array_equal(drawn[0][[0, 2]], drawn[1][[0, 2]])
+
+
 def test_a_bunch_that_is_cut_off_looks_as_in_a_client() -> None:
     """The hand lifts the bunch while the blade cuts. The second world's hand does not cut. After a reset the bunch hangs
     again."""

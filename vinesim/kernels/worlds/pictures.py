@@ -26,6 +26,7 @@ from vinesim.kernels.shading.deferred import Light, sky_radiance, surface_light
 from vinesim.kernels.shading.materials import Materials
 from vinesim.kernels.shading.shadow_maps import ShadowMap
 from vinesim.kernels.shading.tone_rows import tone_entry
+from vinesim.kernels.worlds.reset import MOTION
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -123,6 +124,12 @@ class Motion:
     geom_quat: wp.array2d(dtype=wp.quat)
     geom_size: wp.array2d(dtype=wp.vec3)
     geom_margin: wp.array2d(dtype=float)
+
+
+@wp.func
+def is_drawn(world: int, due: wp.array(dtype=wp.bool), faults: wp.array(dtype=wp.int32)) -> bool:
+    """Returns whether the pictures of a world are wanted, and its numbers are finite."""
+    return due[world] and (faults[world] & MOTION) == 0
 
 
 @wp.func
@@ -243,6 +250,7 @@ def pose_primitives(
     # in
     motion: Motion,
     due: wp.array(dtype=wp.bool),
+    faults: wp.array(dtype=wp.int32),
     # out
     shapes_out: Shapes,
     bounds_out: wp.array3d(dtype=wp.vec3i),
@@ -251,13 +259,13 @@ def pose_primitives(
     """One thread transforms the primitives of one cluster of a world into the world, and bounds them in its pictures.
 
     local: [primitive] of the variants, in the frames of their carriers; clusters: of the variants; due: [world] whether
-    the world's pictures are wanted. shapes: [world * room + i] primitive i of a world; bounds: [world, camera, i] of
+    the world's pictures are wanted; faults: [world], a world whose motion has one is not drawn. shapes: [world * room + i] primitive i of a world; bounds: [world, camera, i] of
     primitives and cluster_bounds: [world, camera, i] of clusters, see :func:`packed_bounds`.
     """
     world, number = wp.tid()
     variant = variants.of_world[world]
     cluster = variants.first_cluster[variant] + number
-    if due[world] and cluster < variants.first_cluster[variant + 1]:
+    if is_drawn(world, due, faults) and cluster < variants.first_cluster[variant + 1]:
         kind = clusters.kind[cluster]
         first = clusters.first[cluster]
         end = first + clusters.size[cluster]
@@ -362,6 +370,7 @@ def draw_pictures(
     # in
     motion: Motion,
     due: wp.array(dtype=wp.bool),
+    faults: wp.array(dtype=wp.int32),
     bounds: wp.array3d(dtype=wp.vec3i),
     cluster_bounds: wp.array3d(dtype=wp.vec3i),
     sky_depth: float,
@@ -373,7 +382,7 @@ def draw_pictures(
 ):
     """One thread finds what ``run`` pixels of a tile of one picture show.
 
-    shapes: [world * room + i] posed primitives; label: of each; due: [world]; bounds, cluster_bounds: see
+    shapes: [world * room + i] posed primitives; label: of each; due, faults: [world]; bounds, cluster_bounds: see
     :func:`pose_primitives`. All outputs are [world, camera, row, column]. primitive: -1 the sky, -2 the ground; depth: m
     along the optical axis, ``sky_depth`` for the sky; labels: see :func:`vinesim.scene.ids.label`.
     """
@@ -381,7 +390,7 @@ def draw_pictures(
     cameras = views.body.shape[0]
     world = picture // cameras
     camera = picture - world * cameras
-    if due[world]:
+    if is_drawn(world, due, faults):
         lens = lens_of(views, motion, world, camera)
         for n in range(part * run, part * run + run):
             place = pixel_of_thread(views.width, n)
@@ -421,6 +430,7 @@ def shade_pictures(
     # in
     motion: Motion,
     due: wp.array(dtype=wp.bool),
+    faults: wp.array(dtype=wp.int32),
     primitive: wp.array4d(dtype=wp.int32),
     depth: wp.array4d(dtype=float),
     run: int,
@@ -436,7 +446,7 @@ def shade_pictures(
     cameras = views.body.shape[0]
     world = picture // cameras
     camera = picture - world * cameras
-    if due[world]:
+    if is_drawn(world, due, faults):
         lens = lens_of(views, motion, world, camera)
         back = wp.transpose(lens.rotation)
         for n in range(part * run, part * run + run):

@@ -111,7 +111,8 @@ class WorldCameras:
     def render(self, worlds: np.ndarray | wp.array | None = None) -> None:
         """Write the pictures of the present states. Call it between two steps; the states do not change.
 
-        ``worlds``: bool [world], whose pictures are wanted, the others stay; None: all are.
+        ``worlds``: bool [world], whose pictures are wanted, the others stay; None: all are. A world with a fault of its
+        motion (:attr:`Worlds.faults`) keeps its pictures, because its numbers may not be finite.
         """
         if worlds is None:
             self._due.fill_(True)
@@ -198,7 +199,7 @@ class WorldCameras:
         bounds = self._zeros(wp.vec3i, worlds.count, cameras, tables.variants.room)
         cluster_bounds = self._zeros(wp.vec3i, worlds.count, cameras, tables.clusters_room)
         tables.bounds = [bounds, cluster_bounds]
-        given = [tables.local, tables.clusters, tables.variants, views, motion, self._due]
+        given = [tables.local, tables.clusters, tables.variants, views, motion, self._due, worlds.faults]
         shape = {"threads": worlds.count, "width": tables.clusters_room, "block": _BLOCKS[0]}
         pose = KernelLaunch(kernels.pose_primitives, given, [tables.shapes, bounds, cluster_bounds], **shape)
 
@@ -210,7 +211,7 @@ class WorldCameras:
         ground = first.primitives.ground
         ground.residual = ground.residual.to(self._device)
         given = [tables.shapes, tables.clusters, tables.variants, views, ground, tables.label]
-        given += [label(Organ.GROUND, 0), motion, self._due, bounds, cluster_bounds, float("inf"), run]
+        given += [label(Organ.GROUND, 0), motion, self._due, worlds.faults, bounds, cluster_bounds, float("inf"), run]
         draw = KernelLaunch(kernels.draw_pictures, given, [self._primitive, self.depth, self.labels], **shape)
         if self.rgb is None:
             return [move, pose, draw]
@@ -226,7 +227,7 @@ class WorldCameras:
         unshaded.depth = self._zeros(float, 0)
         tone = self._array(textures.tone_curve(), wp.uint8)
         given = [tables.shapes, self._materials(first), views, light, unshaded, gain, tone]
-        given += [motion, self._due, self._primitive, self.depth, run]
+        given += [motion, self._due, worlds.faults, self._primitive, self.depth, run]
         return [move, pose, draw, KernelLaunch(kernels.shade_pictures, given, [self.rgb], **shape)]
 
     def _materials(self, first: _Variant) -> Materials:
