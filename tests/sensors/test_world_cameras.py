@@ -194,15 +194,15 @@ def test_a_world_that_explodes_keeps_its_pictures_and_the_others_do_not_notice()
 
 
 def test_a_bunch_that_is_cut_off_looks_as_in_a_client() -> None:
-    """The hand lifts the bunch while the blade cuts. The second world's hand does not cut. After a reset the bunch hangs
-    again."""
+    """The hand lifts the bunch while the blade cuts. The second world's hand does not cut. After a reset the bunch
+    hangs again."""
     physics = client(bunches(1), HAND)
     cutter = physics.add_blade("hand", "palm", *_mouth(), force=200.0)
     worlds = Worlds(bunches(2), 2, robots=[HAND], parameters=PARAMETERS, blade=blade())
     assert worlds.pool is not None
     bunch = bunches(1)
     top = rest_snapshot(bunch).body_q[bunch.bunch_body[0], :3]
-    camera = WorldCamera(pose=look_at(top + [0.35, -0.25, 0.2], top + [0.0, 0.0, 0.05]), field_of_view=0.6)
+    camera = WorldCamera(pose=look_at(top + np.array([0.35, -0.25, 0.2]), top + np.array([0.0, 0.0, 0.05])), field_of_view=0.6)
     cameras = WorldCameras(worlds, [camera], SIZE)
     cameras.render()
     first = cameras.labels.numpy().copy()
@@ -221,7 +221,7 @@ def test_a_bunch_that_is_cut_off_looks_as_in_a_client() -> None:
     other, truth, _ = seen_by_client(physics.model, physics.snapshot(), camera, camera.pose)
     assert_equal_pictures(labels[0, 0], depth[0, 0], other, truth)
     stump = physics.state.body_q[bunch.body_parent[bunch.bunch_body[0]] - 1, :3]
-    above = WorldCamera(pose=look_at(stump + [0.2, -0.2, 0.1], stump), field_of_view=0.4)
+    above = WorldCamera(pose=look_at(stump + np.array([0.2, -0.2, 0.1]), stump), field_of_view=0.4)
     late = WorldCameras(worlds, [above], SIZE)
     late.render()
     labels_above = late.labels.numpy()[0, 0]

@@ -207,8 +207,8 @@ class MujocoWorld:
         return self._visuals
 
     def visual_bodies(self) -> np.ndarray:
-        """Returns the MuJoCo bodies [visual] of the visible rigid bodies, in the order of :meth:`visuals`; 0 for arms and
-        fingers of people."""
+        """Returns the MuJoCo bodies [visual] of the visible rigid bodies, in the order of :meth:`visuals`; 0 for arms
+        and fingers of people."""
         return self._visual_body
 
     def visual_q(self) -> np.ndarray:

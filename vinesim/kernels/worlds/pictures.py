@@ -318,7 +318,9 @@ def pixel_of_thread(width: int, n: int) -> wp.vec2i:
     across = (width + TILE_WIDTH - 1) // TILE_WIDTH
     tile = n // TILE_PIXELS
     lane = n - tile * TILE_PIXELS
-    return wp.vec2i((tile % across) * TILE_WIDTH + lane % TILE_WIDTH, (tile // across) * TILE_HEIGHT + lane // TILE_WIDTH)
+    return wp.vec2i(
+        (tile % across) * TILE_WIDTH + lane % TILE_WIDTH, (tile // across) * TILE_HEIGHT + lane // TILE_WIDTH
+    )
 
 
 @wp.func

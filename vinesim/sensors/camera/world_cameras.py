@@ -1,8 +1,8 @@
 """Cameras of a batch of worlds: pictures of all worlds by one call, in arrays on the batch's device.
 
 Depth and labels are exact: those of :class:`~vinesim.sensors.camera.camera.Camera` without noise. Colours are its exact
-colours in daylight, except that nothing casts a shadow, the ground sees the whole sky, exposure is fixed, and lamps have
-no glare. There is no noise, no distortion and no motion blur.
+colours in daylight, except that nothing casts a shadow, the ground sees the whole sky, exposure is fixed, and lamps
+have no glare. There is no noise, no distortion and no motion blur.
 """
 
 from __future__ import annotations
