@@ -41,7 +41,7 @@ CAMERAS = (
 )
 """Cameras of observed pictures: one beside the base of the arm, and one on its hand, 8 cm above the fingers, which
 looks along them. GUESSED."""
-SPECTATOR = WorldCamera(pose=look_at(np.array([-0.4, -1.0, 1.25]), np.array([0.65, 0.0, 0.7])), field_of_view=0.9)
+SPECTATOR = WorldCamera(pose=look_at(np.array([-0.4, -1.0, 1.25]), np.array([0.55, 0.0, 0.72])), field_of_view=0.8)
 """Camera of ``render``, which sees the arm and the shoots."""
 Plants = Callable[[np.random.Generator, Variation], Model]
 

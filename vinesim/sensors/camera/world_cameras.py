@@ -34,7 +34,7 @@ from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapsho
 from vinesim.sensors.raster.camera_rasterizer import MAX_DEPTH
 from vinesim.sensors.raster.primitive_arrays import CONE
 from vinesim.worlds.bunch_pool import shapes_of_bunches
-from vinesim.worlds.plants import gathered
+from vinesim.worlds.plants import gathered, items_of_trees
 from vinesim.worlds.worlds import Worlds
 
 LARGEST = 1024
@@ -106,7 +106,9 @@ class WorldCameras:
         self.rgb: wp.array | None = self._zeros(wp.vec3ub, *shape) if colours else None
         """[world, camera, row, column] Three numbers of eight bits, sRGB; None without ``colours``."""
         self._due = wp.full(worlds.count, True, dtype=wp.bool, device=self._device)
-        self._graph = KernelGraph(*self._launches(variants[0], np.asarray(sun, float)), device=str(self._device))
+        self.launches = self._all_launches(variants[0], np.asarray(sun, float))
+        """The launches that draw all pictures, by name, in their order."""
+        self._graph = KernelGraph(*self.launches.values(), device=str(self._device))
 
     def render(self, worlds: np.ndarray | wp.array | None = None) -> None:
         """Write the pictures of the present states. Call it between two steps; the states do not change.
@@ -120,6 +122,11 @@ class WorldCameras:
             self._due.assign(worlds)
         self.worlds.bodies.update_kinematics()
         self._graph()
+
+    @property
+    def primitives(self) -> int:
+        """Number of primitives of a world; of the largest one, if worlds differ."""
+        return self._tables.variants.room
 
     def memory(self) -> int:
         """Returns the device memory of a world [byte], without what all worlds share."""
@@ -180,7 +187,7 @@ class WorldCameras:
             setattr(motion, name, getattr(model, name))
         return motion
 
-    def _launches(self, first: _Variant, sun: np.ndarray) -> list[KernelLaunch]:
+    def _all_launches(self, first: _Variant, sun: np.ndarray) -> dict[str, KernelLaunch]:
         worlds = self.worlds
         tables = self._tables
         views = self._views
@@ -213,8 +220,9 @@ class WorldCameras:
         given = [tables.shapes, tables.clusters, tables.variants, views, ground, tables.label]
         given += [label(Organ.GROUND, 0), motion, self._due, worlds.faults, bounds, cluster_bounds, float("inf"), run]
         draw = KernelLaunch(kernels.draw_pictures, given, [self._primitive, self.depth, self.labels], **shape)
+        launches = {"kinematics": move, "pose": pose, "draw": draw}
         if self.rgb is None:
-            return [move, pose, draw]
+            return launches
 
         light = Light()
         set_samples(light, 0, device)
@@ -228,7 +236,7 @@ class WorldCameras:
         tone = self._array(textures.tone_curve(), wp.uint8)
         given = [tables.shapes, self._materials(first), views, light, unshaded, gain, tone]
         given += [motion, self._due, worlds.faults, self._primitive, self.depth, run]
-        return [move, pose, draw, KernelLaunch(kernels.shade_pictures, given, [self.rgb], **shape)]
+        return launches | {"shade": KernelLaunch(kernels.shade_pictures, given, [self.rgb], **shape)}
 
     def _materials(self, first: _Variant) -> Materials:
         made = Materials()
@@ -336,11 +344,12 @@ def _variants(worlds: Worlds, grass: float) -> tuple[list[_Variant], np.ndarray]
     visuals = tuple(rigid.visuals()[k] for k in shown)
     bodies = rigid.visual_bodies()[shown]
     trees = np.arange(len(worlds.model.tree_first) // worlds.count) * worlds.count
+    items = items_of_trees(worlds.model)
     known: dict[str, int] = {}
     variants = []
     of_world = np.zeros(worlds.count, np.int32)
     for world in range(worlds.count):
-        model = gathered(worlds.model, trees + world)
+        model = gathered(worlds.model, trees + world, items)
         digest = model.digest()
         if digest not in known:
             known[digest] = len(variants)
