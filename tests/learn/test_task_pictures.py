@@ -1,5 +1,7 @@
 """Pictures of the learning tasks: as observations, and by ``render``."""
 
+import pathlib
+import re
 from typing import Any
 
 import numpy as np
@@ -103,6 +105,14 @@ def test_render_gives_a_picture_of_each_world() -> None:
     blind = gymnasium.make_vec("vinesim/Reach-v0", num_envs=2)
     blind.reset(seed=1)
     assert blind.unwrapped.render() is None
+
+
+def test_the_example_of_the_page_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    """The block of docs/worlds.md."""
+    page = (pathlib.Path(__file__).parents[2] / "docs" / "worlds.md").read_text()
+    (block,) = re.findall(r"<!-- place: tests/learn/test_task_pictures.py -->\n```python\n(.*?)```", page, re.DOTALL)
+    exec(block, {})
+    assert capsys.readouterr().out.startswith("(2, 2, 128, 128, 3) 0.")
 
 
 def test_bad_arguments_are_named() -> None:

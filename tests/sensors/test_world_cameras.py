@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from tests.support.terrain_scenes import hills
 from vinesim.core import frames
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import LABEL_STRIDE, Organ
@@ -39,6 +40,12 @@ NEAR = 10.0
 def shoot_worlds(seeds: list[int]) -> Worlds:
     models = [shoots(2, np.random.default_rng(seed), 1.0) for seed in seeds]
     return Worlds(plants_of_worlds(models, len(seeds)), len(seeds), robots=[arm((-0.1, 0.0, 0.6), HOME)])
+
+
+def worlds_on_hills() -> Worlds:
+    model = shoots(2, np.random.default_rng(1), 1.0)
+    model.terrain = hills(2, roughness=0.03)
+    return Worlds(model, 1, robots=[arm((-0.1, 0.0, 0.6), HOME)])
 
 
 def vine_worlds(count: int) -> Worlds:
@@ -83,7 +90,9 @@ def assert_equal_pictures(labels: np.ndarray, depth: np.ndarray, other: np.ndarr
     np.testing.assert_array_equal(np.isinf(depth[same]), np.isinf(truth[same]))
 
 
-@pytest.mark.parametrize("make", [lambda: shoot_worlds([1]), lambda: vine_worlds(1)], ids=["shoots", "vine"])
+@pytest.mark.parametrize(
+    "make", [lambda: shoot_worlds([1]), lambda: vine_worlds(1), worlds_on_hills], ids=["shoots", "vine", "hills"]
+)
 @pytest.mark.parametrize("camera", [FIXED, ON_HAND], ids=["fixed", "on_hand"])
 def test_a_world_looks_as_a_client_sees_it(make, camera: WorldCamera) -> None:
     """After half a second in which the arm moves and the plants swing."""
@@ -202,7 +211,8 @@ def test_a_bunch_that_is_cut_off_looks_as_in_a_client() -> None:
     assert worlds.pool is not None
     bunch = bunches(1)
     top = rest_snapshot(bunch).body_q[bunch.bunch_body[0], :3]
-    camera = WorldCamera(pose=look_at(top + np.array([0.35, -0.25, 0.2]), top + np.array([0.0, 0.0, 0.05])), field_of_view=0.6)
+    eye = top + np.array([0.35, -0.25, 0.2])
+    camera = WorldCamera(pose=look_at(eye, top + np.array([0.0, 0.0, 0.05])), field_of_view=0.6)
     cameras = WorldCameras(worlds, [camera], SIZE)
     cameras.render()
     first = cameras.labels.numpy().copy()

@@ -60,7 +60,7 @@ def joined(models: Sequence[Model]) -> Model:
 
 
 Items = dict[str, tuple[np.ndarray, np.ndarray]]
-"""By kind, the items of a model in the order of their trees, and [tree + 1] the first one of each tree in this order."""
+"""By kind: items of a model in the order of their trees, and the first one of each tree in this order [tree + 1]."""
 
 
 def items_of_trees(model: Model) -> Items:
@@ -74,8 +74,8 @@ def items_of_trees(model: Model) -> Items:
 
 
 def gathered(pool: Model, trees: np.ndarray, items: Items | None = None) -> Model:
-    """Returns a model with the ``trees`` [k] of another one, which may repeat. ``items``: :func:`items_of_trees` of the
-    other model, which spares much time if it is given with each of many calls."""
+    """Returns a model with the ``trees`` [k] of another one, which may repeat. ``items``: :func:`items_of_trees` of
+    the other model, which spares much time if it is given with each of many calls."""
     size = pool.tree_size[trees]
     first = np.cumsum(size) - size
     shift = first - pool.tree_first[trees]
