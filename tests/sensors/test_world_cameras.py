@@ -1,12 +1,15 @@
 """Pictures of all worlds of a batch: as a client's camera sees the same world, and independent of the other worlds."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.support.terrain_scenes import hills
 from vinesim.core import frames
+from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.plants.device_buffers import DeviceBuffers
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import LABEL_STRIDE, Organ
 from vinesim.scene.model import Model
@@ -57,6 +60,12 @@ def vine_worlds(count: int) -> Worlds:
     return Worlds(plants_of_worlds(models, count), count, robots=[arm((at[0] - 0.5, at[1] - 0.7, 1.0), HOME)])
 
 
+def fixed_in(worlds: Worlds) -> WorldCamera:
+    """The camera FIXED, where it sees the arm of these worlds."""
+    away = worlds.bodies.rigid.robot("arm").spec.pose[:3] - np.array([-0.1, 0.0, 0.6])
+    return dataclasses.replace(FIXED, pose=np.append(FIXED.pose[:3] + away, FIXED.pose[3:]))
+
+
 def snapshot_of(worlds: Worlds) -> Snapshot:
     """The state of a batch with one world as a client would publish it."""
     worlds.download()
@@ -100,9 +109,8 @@ def test_a_world_looks_as_a_client_sees_it(make, camera: WorldCamera) -> None:
     home = worlds.bodies.targets.numpy()
     worlds.bodies.targets.assign(home + np.array([0.3, 0.2, -0.3, 0.2, 0.2, 0.1, 0.0, 0.02, -0.02], np.float32))
     worlds.step(50)
-    at = worlds.bodies.rigid.robot("arm").spec.pose[:3] - [-0.1, 0.0, 0.6]
     if camera is FIXED:
-        camera = dataclasses.replace(FIXED, pose=np.append(FIXED.pose[:3] + at, FIXED.pose[3:]))
+        camera = fixed_in(worlds)
     cameras = WorldCameras(worlds, [camera], SIZE)
     cameras.render()
     snapshot = snapshot_of(worlds)
@@ -130,13 +138,13 @@ def test_a_world_looks_as_a_client_sees_it(make, camera: WorldCamera) -> None:
 @pytest.mark.parametrize("make", [shoot_worlds, lambda seeds: vine_worlds(len(seeds))], ids=["shoots", "vine"])
 def test_pictures_of_all_worlds_are_those_of_each_world_alone_to_the_bit(make) -> None:
     together = make([1, 2, 3])
-    cameras = WorldCameras(together, [FIXED, ON_HAND], SIZE)
+    cameras = WorldCameras(together, [fixed_in(together), ON_HAND], SIZE)
     together.step(3)
     cameras.render()
     trees = np.arange(len(together.model.tree_first) // 3) * 3
     for world in range(3):
         alone = Worlds(gathered(together.model, trees + world), 1, robots=[together.bodies.rigid.robot("arm").spec])
-        single = WorldCameras(alone, [FIXED, ON_HAND], SIZE)
+        single = WorldCameras(alone, [fixed_in(alone), ON_HAND], SIZE)
         alone.step(3)
         single.render()
         for one, other in ((cameras.depth, single.depth), (cameras.labels, single.labels), (cameras.rgb, single.rgb)):
@@ -171,6 +179,26 @@ def test_pictures_follow_the_arm_and_a_reset_and_do_not_change_the_states() -> N
     for before, at_first, now in zip(moved, first, pictures(), strict=True):
         np.testing.assert_array_equal(now[0], before[0])
         np.testing.assert_array_equal(now[1], at_first[1])
+
+
+def test_pictures_are_the_same_in_the_order_of_bodies_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four trees lie side by side in the kernels' arrays."""
+
+    def drawn() -> np.ndarray:
+        worlds = vine_worlds(3)
+        cameras = WorldCameras(worlds, [fixed_in(worlds), ON_HAND], SIZE)
+        worlds.step(5)
+        cameras.render()
+        assert (cameras.labels.numpy() // LABEL_STRIDE == int(Organ.LEAF)).sum() > 300
+        return cameras.depth.numpy()
+
+    expected = drawn()
+
+    def interleaved(*given: Any, device: str) -> ArticulationSolver:
+        return ArticulationSolver(*given, buffers=DeviceBuffers(device, 4))
+
+    monkeypatch.setattr("vinesim.worlds.worlds.ArticulationSolver", interleaved)
+    np.testing.assert_array_equal(drawn(), expected)
 
 
 def test_only_the_wanted_pictures_are_drawn() -> None:

@@ -8,7 +8,6 @@ import gymnasium
 import numpy as np
 import warp as wp
 
-from vinesim.kernels.graph import outside_captures
 from vinesim.kernels.learn.pictures import limit_depth
 from vinesim.sensors.camera.world_cameras import WorldCamera, WorldCameras
 from vinesim.worlds.worlds import Worlds
@@ -46,7 +45,6 @@ class ObservedPictures:
         """Returns arrays for pictures of all worlds."""
         return {name: wp.zeros_like(array) for name, array in self._drawn().items()}
 
-    @outside_captures()
     def write(self, pictures: Pictures, worlds: wp.array | None = None) -> None:
         """Write pictures of the present states. ``worlds``: bool [world], which may have changed since the last call;
         None: all."""
