@@ -30,7 +30,7 @@ from vinesim.worlds.worlds import Worlds
 
 pytestmark = pytest.mark.slow
 
-SIZE = (96, 88)
+SIZE = (97, 90)
 FIXED = WorldCamera(pose=look_at(np.array([-0.5, -0.8, 1.1]), np.array([0.9, 0.0, 0.7])), field_of_view=0.9)
 ON_HAND = WorldCamera(
     pose=frames.pose(np.array([0.05, 0.0, 0.08]), frames.OPTICAL), field_of_view=1.2, actor="arm", link="link_6"
