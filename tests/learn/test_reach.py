@@ -166,8 +166,6 @@ def test_the_examples_of_the_page_run():
 def test_bad_arguments_are_named():
     with pytest.raises(ValueError, match="num_envs 0"):
         gymnasium.make_vec("vinesim/Reach-v0", num_envs=0)
-    with pytest.raises(ValueError, match="render_mode"):
-        gymnasium.make_vec("vinesim/Reach-v0", num_envs=1, render_mode="rgb_array")
     with pytest.raises(ValueError, match="arrays 'jax': give one of numpy, torch, warp"):
         gymnasium.make_vec("vinesim/Reach-v0", num_envs=1, arrays="jax")
     with pytest.raises(gymnasium.error.NameNotFound, match="Reach"):

@@ -9,13 +9,16 @@ from typing import Any
 
 import numpy as np
 
+from vinesim.core import frames
 from vinesim.kernels.graph import KernelLaunch
-from vinesim.learn.arm import AXES, arm
+from vinesim.learn.arm import AXES, TOOL_LINK, arm
 from vinesim.learn.arm_arrays import ArmArrays, arrays_of_worlds
 from vinesim.learn.task_env import TaskEnv, check_options
 from vinesim.learn.variation import Variation, as_variation
 from vinesim.scene.model import Model
 from vinesim.scene.values import RobotSpec
+from vinesim.sensors.camera.world_cameras import WorldCamera
+from vinesim.sensors.export.images import look_at
 from vinesim.worlds.plants import plants_of_worlds
 from vinesim.worlds.worlds import Worlds
 
@@ -28,6 +31,18 @@ HOME = np.array([0.0, -2.3, 0.0, 1.9, 0.0, 1.6, 0.0, 0.0, 0.0])
 MAX_EPISODE_STEPS = 100
 VARIANTS = 64
 """Default for the number of different groups of plants; further worlds repeat them."""
+PICTURE_SIZE = 64
+"""[px] Default for the width and height of observed pictures."""
+CAMERAS = (
+    WorldCamera(pose=look_at(np.array([-0.3, -0.35, 1.15]), np.array([0.95, 0.05, 0.75])), field_of_view=0.9),
+    WorldCamera(
+        pose=frames.pose(np.array([0.05, 0.0, 0.08]), frames.OPTICAL), field_of_view=1.2, actor="arm", link=TOOL_LINK
+    ),
+)
+"""Cameras of observed pictures: one beside the base of the arm, and one on its hand, 8 cm above the fingers, which
+looks along them. GUESSED."""
+SPECTATOR = WorldCamera(pose=look_at(np.array([-0.4, -1.0, 1.25]), np.array([0.55, 0.0, 0.72])), field_of_view=0.8)
+"""Camera of ``render``, which sees the arm and the shoots."""
 Plants = Callable[[np.random.Generator, Variation], Model]
 
 
@@ -48,6 +63,10 @@ class ArmEnv(TaskEnv):
         max_episode_steps: number of actions after which an episode is truncated.
         robot: the robot, whose first drives are the seven joints; None: :func:`~vinesim.learn.arm.arm`.
         actions: number of an action's components, if the task has more.
+        render_mode: ``"rgb_array"`` or None; see :meth:`~vinesim.learn.task_env.TaskEnv.render`.
+        observation: ``"state"`` or ``"pictures"``: the numbers, or a dictionary of the numbers (``state``) and of
+            pictures of :data:`CAMERAS`; see :class:`~vinesim.learn.task_env.TaskEnv`.
+        picture_size: width and height of these pictures [px].
         options: further arguments of :class:`~vinesim.worlds.worlds.Worlds`.
     """
 
@@ -64,11 +83,13 @@ class ArmEnv(TaskEnv):
         variation: Variation | str | pathlib.Path = Variation(),
         max_episode_steps: int = MAX_EPISODE_STEPS,
         render_mode: str | None = None,
+        observation: str = "state",
+        picture_size: int = PICTURE_SIZE,
         robot: RobotSpec | None = None,
         actions: int = len(AXES),
         **options: Any,
     ) -> None:
-        check_options(num_envs, arrays, render_mode)
+        check_options(num_envs, arrays, render_mode, observation, picture_size)
         ranges = as_variation(variation)
         variants = [
             plants(np.random.default_rng([vines_seed, number]), ranges) for number in range(min(num_envs, vines))
@@ -89,6 +110,10 @@ class ArmEnv(TaskEnv):
             rng=np.random.default_rng([vines_seed, vines]),
             max_episode_steps=max_episode_steps,
             render_mode=render_mode,
+            observation=observation,
+            cameras=CAMERAS,
+            picture_size=picture_size,
+            spectator=SPECTATOR,
         )
 
     @functools.cached_property

@@ -34,8 +34,8 @@ class Totals(NamedTuple):
 class RslEnv(VecEnv):
     """A task as a ``VecEnv`` of rsl_rl: ``OnPolicyRunner(RslEnv(ReachEnv(4096, device="cuda", arrays="torch")), ...)``.
 
-    Observations are in the group ``policy``. The logged ``/success`` is the share of worlds whose last episode ended
-    with success.
+    Observations are in the group ``policy``, pictures in groups with their names. The logged ``/success`` is the share
+    of worlds whose last episode ended with success.
 
     ``env``: the task, with arrays of PyTorch. Raises :class:`ValueError` for others.
     """
@@ -87,4 +87,7 @@ class RslEnv(VecEnv):
         return Totals(reward, *map(round, counts))
 
     def _grouped(self, observation: Any) -> Any:
-        return TensorDict({"policy": observation}, batch_size=[self.num_envs])
+        groups = {"policy": observation}
+        if isinstance(observation, dict):
+            groups = {"policy" if name == "state" else name: values for name, values in observation.items()}
+        return TensorDict(groups, batch_size=[self.num_envs])

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from vinesim.learn.task_env import TaskEnv
+from vinesim.learn.task_env import TaskEnv, of_world
 from vinesim.worlds.errors import MissingExtra
 
 try:
@@ -29,8 +29,8 @@ class StableBaselinesEnv(VecEnv):
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
         self._actions = np.zeros(env.action_space.shape or (), np.float32)
 
-    def reset(self) -> np.ndarray:
-        """Begin an episode in all worlds. Returns the observations [world, k]."""
+    def reset(self) -> Any:
+        """Begin an episode in all worlds. Returns the observations [world, k], or a dictionary with pictures, too."""
         observation, _ = self.env.reset(seed=self._seeds[0])
         self._reset_seeds()
         self._reset_options()
@@ -40,7 +40,7 @@ class StableBaselinesEnv(VecEnv):
         """Keep the actions [world, k] for :meth:`step_wait`."""
         self._actions = actions
 
-    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+    def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Take the actions. Returns observations, rewards, which worlds ended, and a dictionary for each world."""
         observation, reward, terminated, truncated, info = self.env.step(self._actions)
         ended = terminated | truncated
@@ -49,7 +49,7 @@ class StableBaselinesEnv(VecEnv):
             for success, fault, late in zip(info["success"], info["fault"], truncated, strict=True)
         ]
         for world in np.flatnonzero(ended):
-            infos[world]["terminal_observation"] = info["final_obs"][world]
+            infos[world]["terminal_observation"] = of_world(info["final_obs"], world)
         return observation, reward, ended, infos
 
     def close(self) -> None:

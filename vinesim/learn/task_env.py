@@ -18,12 +18,19 @@ from gymnasium.vector.utils import batch_space
 
 from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.learn.episodes import delay_actions, end_episodes, forget_actions
+from vinesim.learn.task_pictures import ObservedPictures, Pictures, Spectator
 from vinesim.learn.variation import Variation
+from vinesim.sensors.camera.world_cameras import WorldCamera
 from vinesim.worlds.errors import MissingExtra
 from vinesim.worlds.worlds import Worlds
 
 ARRAYS = ("numpy", "torch", "warp")
 """Libraries whose arrays an environment can give and take."""
+OBSERVATIONS = ("state", "pictures")
+"""What a policy can get: numbers, or numbers and pictures."""
+RENDER_MODES = ("rgb_array",)
+SMALLEST, LARGEST = 8, 256
+"""[px] Limits of the size of observed pictures."""
 STEPS = 4
 """Steps of 10 ms between two actions."""
 
@@ -40,6 +47,9 @@ class _Results(NamedTuple):
     truncated: wp.array
     ended: wp.array
     fault: wp.array
+    pictures: Pictures
+    """Empty, unless pictures are observed."""
+    last_pictures: Pictures
 
 
 class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
@@ -53,6 +63,13 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
     With arrays on the device, nothing is copied to the host. Results of an action are overwritten by the action after
     the next one, and ``final_obs`` is always present.
 
+    With ``observation="pictures"`` an observation is a dictionary of ``state``, the numbers, and the pictures of the
+    task's cameras (:mod:`vinesim.sensors.camera.world_cameras`): ``rgb`` uint8 [world, camera, row, column, 3],
+    ``depth`` float32 m, at most 10 m, which is also that of the sky, and ``labels`` int32
+    (:func:`vinesim.scene.ids.label`), both [world, camera, row, column].
+
+    With ``render_mode="rgb_array"``, :meth:`render` draws a picture of each world when it is called.
+
     Args:
         worlds: the worlds.
         actions: number of an action's components, each from -1 to 1.
@@ -62,12 +79,21 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         variation: ranges of frictions and delays of the worlds.
         rng: draws from these ranges.
         max_episode_steps: number of actions after which an episode is truncated.
+        render_mode: ``"rgb_array"`` or None.
+        observation: one of :data:`OBSERVATIONS`.
+        cameras: cameras of observed pictures, the same in all worlds.
+        picture_size: width and height of observed pictures [px], 8 to 256.
+        spectator: camera of :meth:`render`.
 
-    Raises :class:`ValueError` for an unknown library or a render mode,
+    Raises :class:`ValueError` for an unknown library, observation or render mode, or a size that is none,
     :class:`~vinesim.worlds.errors.MissingExtra` if PyTorch is wanted and not installed.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
+    metadata: ClassVar[dict[str, Any]] = {
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+        "render_modes": [*RENDER_MODES],
+        "render_fps": 25,
+    }
 
     def __init__(
         self,
@@ -81,18 +107,28 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         rng: np.random.Generator,
         max_episode_steps: int,
         render_mode: str | None,
+        observation: str,
+        cameras: Sequence[WorldCamera],
+        picture_size: int,
+        spectator: WorldCamera,
     ) -> None:
-        check_options(worlds.count, arrays, render_mode)
+        check_options(worlds.count, arrays, render_mode, observation, picture_size)
         self.worlds = worlds
         self.num_envs = worlds.count
-        self.render_mode = None
+        self.render_mode = render_mode
+        self._spectator = Spectator(worlds, spectator)
         self.num_actions = actions
         self.num_observations = numbers
         self.max_episode_steps = max_episode_steps
         self.arrays = arrays
         self.device = device
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (actions,), np.float32)
-        self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (numbers,), np.float32)
+        state = gymnasium.spaces.Box(-np.inf, np.inf, (numbers,), np.float32)
+        self.single_observation_space: gymnasium.Space = state
+        self._pictures: ObservedPictures | None = None
+        if observation == "pictures":
+            self._pictures = ObservedPictures(worlds, cameras, picture_size)
+            self.single_observation_space = gymnasium.spaces.Dict({"state": state, **self._pictures.spaces})
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._given_action = self.empty(float, actions)  # the last one; ``_action`` is the one that its delay lets act
@@ -105,6 +141,7 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         """[world] Number of actions of the episode so far, on the device."""
         self._episode = self.empty(wp.int32)
         self._begins = self.empty(wp.bool)
+        self._nowhere = self.empty(wp.bool)
         self._failed = self.empty(wp.bool)
         """[world] Whether success is no longer possible, so that the episode ends. Judgements may write it."""
         unused = (self.empty(float), self.empty(wp.bool))
@@ -121,7 +158,8 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
     def _results_of(self, numbers: int) -> _Results:
         empty = self.empty
         of_worlds = (float, wp.bool, wp.bool, wp.bool, wp.bool, wp.int32)
-        return _Results(empty(float, numbers), empty(float, numbers), *(empty(dtype) for dtype in of_worlds))
+        pictures = [{} if self._pictures is None else self._pictures.empty() for _ in range(2)]
+        return _Results(empty(float, numbers), empty(float, numbers), *(empty(dtype) for dtype in of_worlds), *pictures)
 
     def empty(self, dtype: Any, *shape: int) -> wp.array:
         """Returns an array of zeros on the device with a row for each world."""
@@ -151,11 +189,11 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         """Returns the launches that begin an episode in the worlds of ``_begins``, after their reset."""
 
     def _judgements(self, results: _Results) -> list[KernelLaunch]:
-        _, last, reward, success, *flags = results
         given = [self.max_episode_steps, self.worlds.faults, self._failed]
-        written = [self.elapsed, last, reward, success, *flags]
+        flags = [results.success, results.terminated, results.truncated, results.ended, results.fault]
+        written = [self.elapsed, results.last, results.reward, *flags]
         return [
-            *self._observations(last, reward, success),
+            *self._observations(results.last, results.reward, results.success),
             KernelLaunch(end_episodes, given, written, threads=self.num_envs),
         ]
 
@@ -176,7 +214,9 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         results = self._next_results()
         results.success.zero_()
         self._observe[self._turn]()
-        return self._given(results.observation), {"success": self._given(results.success)}
+        if self._pictures is not None:
+            self._pictures.write(results.pictures)
+        return self._observed(results.observation, results.pictures), {"success": self._given(results.success)}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Take one action in each world; see the class and :class:`gymnasium.vector.VectorEnv`."""
@@ -186,17 +226,26 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         self.worlds.step(STEPS)
         self.worlds.bodies.update_kinematics()
         self._judge[self._turn]()
+        if self._pictures is not None:
+            self._pictures.write(results.last_pictures)
         on_host = self.arrays == "numpy"
         if any_ended := not on_host or bool(results.ended.numpy().any()):
             wp.copy(self._begins, results.ended)
             self._begin_again()
         self._observe[self._turn]()
+        if self._pictures is not None:
+            self._pictures.write(results.pictures, self._begins if any_ended else self._nowhere)
         info: dict[str, Any] = {"success": self._given(results.success), "fault": self._given(results.fault)}
         if any_ended:
-            info |= {"final_obs": self._given(results.last), "_final_obs": self._given(results.ended)}
-        given = (results.observation, results.reward, results.terminated, results.truncated)
-        observation, reward, terminated, truncated = map(self._given, given)
-        return observation, reward, terminated, truncated, info
+            last = self._observed(results.last, results.last_pictures)
+            info |= {"final_obs": last, "_final_obs": self._given(results.ended)}
+        reward, terminated, truncated = map(self._given, (results.reward, results.terminated, results.truncated))
+        return self._observed(results.observation, results.pictures), reward, terminated, truncated, info
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Returns a picture [height, width, 3] uint8 of the present state of each world, on the host; None without a
+        render mode."""
+        return None if self.render_mode is None else self._spectator.frames()
 
     def _next_results(self) -> _Results:
         """Returns the arrays of the older results, which are overwritten now."""
@@ -218,6 +267,12 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
             raise ValueError(f"actions of shape {given.shape}: give {self._action.shape}")
         wp.copy(self._given_action, given)
 
+    def _observed(self, state: wp.array, pictures: Pictures) -> Any:
+        """Returns an observation in arrays of the wanted library."""
+        if self._pictures is None:
+            return self._given(state)
+        return {"state": self._given(state), **{name: self._given(array) for name, array in pictures.items()}}
+
     def _given(self, array: wp.array) -> Any:
         """Returns an array of the wanted library."""
         if self.arrays == "numpy":
@@ -225,12 +280,23 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         return array if self.arrays == "warp" else wp.to_torch(array)
 
 
-def check_options(num_envs: int, arrays: str, render_mode: str | None) -> None:
+def of_world(observation: Any, world: Any) -> Any:
+    """Returns the observation of one world, of all worlds' arrays or of a dictionary of them."""
+    if isinstance(observation, dict):
+        return {name: values[world] for name, values in observation.items()}
+    return observation[world]
+
+
+def check_options(num_envs: int, arrays: str, render_mode: str | None, observation: str, picture_size: int) -> None:
     """Check what can be wrong with an environment's arguments, before the worlds are made; see :class:`TaskEnv`."""
     if num_envs < 1:
         raise ValueError(f"num_envs {num_envs}: give at least 1")
-    if render_mode is not None:
-        raise ValueError(f"render_mode {render_mode!r}: this environment has none")
+    if render_mode is not None and render_mode not in RENDER_MODES:
+        raise ValueError(f"render_mode {render_mode!r}: give {' or '.join(RENDER_MODES)}, or None")
+    if observation not in OBSERVATIONS:
+        raise ValueError(f"observation {observation!r}: give {' or '.join(OBSERVATIONS)}")
+    if not SMALLEST <= picture_size <= LARGEST:
+        raise ValueError(f"picture_size {picture_size}: give {SMALLEST} to {LARGEST} px")
     if arrays not in ARRAYS:
         raise ValueError(f"arrays {arrays!r}: give one of {', '.join(ARRAYS)}")
     if arrays == "torch":

@@ -206,6 +206,11 @@ class MujocoWorld:
         """
         return self._visuals
 
+    def visual_bodies(self) -> np.ndarray:
+        """Returns the MuJoCo bodies [visual] of the visible rigid bodies, in the order of :meth:`visuals`; 0 for arms
+        and fingers of people."""
+        return self._visual_body
+
     def visual_q(self) -> np.ndarray:
         """Returns the world poses [visual, 7] of the visible rigid bodies, in the order of :meth:`visuals`."""
         self.update_kinematics()

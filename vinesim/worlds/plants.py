@@ -29,7 +29,7 @@ def plants_of_worlds(models: Sequence[Model], count: int) -> Model:
         other = len(models[odd[0]].tree_first)
         raise ValueError(f"model {odd[0]} has {other} trees, model 0 has {trees}: all worlds need as many trees")
     first = np.cumsum([0, *(len(model.tree_first) for model in models[:-1])])
-    return _gathered(joined(models), (np.arange(trees)[:, None] + first[np.arange(count) % len(models)]).ravel())
+    return gathered(joined(models), (np.arange(trees)[:, None] + first[np.arange(count) % len(models)]).ravel())
 
 
 def joined(models: Sequence[Model]) -> Model:
@@ -59,17 +59,30 @@ def joined(models: Sequence[Model]) -> Model:
     return whole
 
 
-def _gathered(pool: Model, trees: np.ndarray) -> Model:
-    """Returns a model with the trees [k] of another one, which may repeat."""
+Items = dict[str, tuple[np.ndarray, np.ndarray]]
+"""By kind: items of a model in the order of their trees, and the first one of each tree in this order [tree + 1]."""
+
+
+def items_of_trees(model: Model) -> Items:
+    """Returns the bunches, ties and leaves of each tree of a model."""
+    items = {}
+    for kind, (of, *_) in _OF_BODY.items():
+        owner = model.body_tree[getattr(model, of)]
+        order = np.argsort(owner, kind="stable")
+        items[kind] = order, np.searchsorted(owner[order], np.arange(len(model.tree_first) + 1))
+    return items
+
+
+def gathered(pool: Model, trees: np.ndarray, items: Items | None = None) -> Model:
+    """Returns a model with the ``trees`` [k] of another one, which may repeat. ``items``: :func:`items_of_trees` of
+    the other model, which spares much time if it is given with each of many calls."""
     size = pool.tree_size[trees]
     first = np.cumsum(size) - size
     shift = first - pool.tree_first[trees]
     rows = {"tree": trees, "body": spans(pool.tree_first[trees], size)}
     moved = {"tree": shift, "body": np.repeat(shift, size)}
-    for kind, (of, *_) in _OF_BODY.items():
-        owner = pool.body_tree[getattr(pool, of)]
-        order = np.argsort(owner, kind="stable")
-        begin, end = (np.searchsorted(owner[order], trees, side=side) for side in ("left", "right"))
+    for kind, (order, start) in (items or items_of_trees(pool)).items():
+        begin, end = start[trees], start[trees + 1]
         rows[kind] = order[spans(begin, end - begin)]
         moved[kind] = np.repeat(shift, end - begin)
     sizes = {kind: len(rows[kind]) for kind in rows}

@@ -288,6 +288,31 @@ class OutdoorLight:
         return OutdoorLight(np.zeros(3), *other, self.dim * share, self.brightness * share, np.ones(3))
 
 
+def set_daylight(light: deferred.Light, sun: np.ndarray, now: OutdoorLight, palette: Palette, device: str) -> None:
+    """Set the colours of ``light``, and its table of the sky. ``sun``: unit vector [3] towards it; ``now``: the
+    daylight."""
+    light.sun = _vector(sun)
+    light.sun_colour = _vector(now.sun)
+    light.sky_colour = _vector(now.sky)
+    light.haze_colour = _vector(now.haze)
+    light.haze_rate = palette.sky.haze_rate
+    light.ground_colour = _vector(now.ground)
+    light.canopy_colour = _vector(now.canopy)
+    table = textures.sky_texture(tuple(sun), tuple(now.sun), palette.sky) * np.float32(now.dim)
+    light.sky_table = wp.array(table, dtype=wp.vec3, device=device)
+
+
+def set_samples(light: deferred.Light, taps: int, device: str) -> None:
+    """Set the samples of shadows of ``light``, see its ``shadow_taps``."""
+    light.shadow_taps = taps
+    k = np.arange(max(taps, 1))
+    angle = 2.399963 * k
+    radius = np.sqrt((k + 0.5) / len(k))
+    light.sample_spiral = _pairs(radius * np.cos(angle), radius * np.sin(angle), device)
+    turn = np.arange(64) * (2.0 * np.pi / 64)
+    light.sample_rotations = _pairs(np.cos(turn), np.sin(turn), device)
+
+
 class Sunlight:
     """Light of sun and sky, and the two shadow maps, for one camera."""
 
@@ -319,13 +344,7 @@ class Sunlight:
         self.brightness = 1.0
         """Illuminance of the ground, relative to noon."""
         light = deferred.Light()
-        light.shadow_taps = taps
-        k = np.arange(max(taps, 1))
-        angle = 2.399963 * k
-        radius = np.sqrt((k + 0.5) / len(k))
-        light.sample_spiral = _pairs(radius * np.cos(angle), radius * np.sin(angle), device)
-        turn = np.arange(64) * (2.0 * np.pi / 64)
-        light.sample_rotations = _pairs(np.cos(turn), np.sin(turn), device)
+        set_samples(light, taps, device)
         self.light = light
         workers = workers or ThreadPool(1)
         side = 1024 * fine
@@ -350,15 +369,7 @@ class Sunlight:
         now = OutdoorLight.of(direction[2], palette)
         if light.flash > 0.0:
             now = now.dimmed(10.0 ** (direction[2] / _TWILIGHT))
-        light.sun = _vector(direction)
-        light.sun_colour = _vector(now.sun)
-        light.sky_colour = _vector(now.sky)
-        light.haze_colour = _vector(now.haze)
-        light.haze_rate = palette.sky.haze_rate
-        light.ground_colour = _vector(now.ground)
-        light.canopy_colour = _vector(now.canopy)
-        table = textures.sky_texture(tuple(direction), tuple(now.sun), palette.sky) * np.float32(now.dim)
-        light.sky_table = wp.array(table, dtype=wp.vec3, device=self._device)
+        set_daylight(light, direction, now, palette, self._device)
         self.brightness = now.brightness
         self.balance = now.balance
         raised = np.array([direction[0], direction[1], max(direction[2], 0.1)])

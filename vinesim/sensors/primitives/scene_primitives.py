@@ -113,7 +113,7 @@ class Primitives:
             self.rasterizer = CudaRasterizer(device)
         self._bodies = len(model.body_mass)
         self._wires = wire_segments(model)
-        self._static_carrier = self._bodies + len(self._wires)
+        self.static_carrier = self._bodies + len(self._wires)
         """Index of the carrier (row of poses) of the static scene. Lower indices are bodies of plants, then segments of
         wires; higher indices are rigid bodies."""
         self._wires_away = np.zeros(0, int)
@@ -212,7 +212,7 @@ class Primitives:
         ``grass``: tufts per square metre.
         """
         low, high = _ground_extent(self.model)
-        layout = lay_out(self._plant_batches(grass, low, high), [], self._static_carrier)
+        layout = lay_out(self._plant_batches(grass, low, high), [], self.static_carrier)
         baked = {field.name: getattr(layout, field.name) for field in dataclasses.fields(layout)}
         baked["sky"] = np.zeros(len(layout.label), np.float32)
         baked["ground_sky"] = np.zeros((1, 1), np.float32)
@@ -246,7 +246,7 @@ class Primitives:
         """Returns the primitives of plants and trellis, and of grass and fallen leaves on the ground between the
         corners ``low`` and ``high`` [2] m."""
         model = self.model
-        static = self._static_carrier
+        static = self.static_carrier
         batches = [*cane_batches(model), *leaf_batches(model), *dormant_batches(model)]
         every = np.arange(len(model.bunch_body))
         pieces = [bunch_bodies(model, int(bunch)) for bunch in every]
@@ -326,12 +326,12 @@ class Primitives:
         self.lamp_primitives = lamps
         """Indices of the primitives that emit light."""
         self._bind()
-        poses = np.zeros((self._static_carrier + 1 + len(visuals), 7), np.float32)
+        poses = np.zeros((self.static_carrier + 1 + len(visuals), 7), np.float32)
         poses[:, 6] = 1.0
         if len(self._poses):
-            poses[: self._static_carrier] = self._poses[: self._static_carrier]
+            poses[: self.static_carrier] = self._poses[: self.static_carrier]
         else:
-            poses[: self._bodies], poses[self._bodies : self._static_carrier] = self._body_q, self._wires.rest_q
+            poses[: self._bodies], poses[self._bodies : self.static_carrier] = self._body_q, self._wires.rest_q
         self._pose_array = wp.array(poses, dtype=wp.transform, device=self.device)
         self._poses = self._pose_array.numpy() if self._pose_array.device.is_cpu else poses
         """[carrier, 7] World pose of each carrier. On a CPU this is the memory that kernels read."""
@@ -424,7 +424,7 @@ class Primitives:
         carrier, organ, kind, first, last = (self._columns[name].numpy()[: self.plant_count] for name in names)
         for row, sizes in self._leaves_before.items():
             first[row, 3], last[row, 3] = sizes
-        segment = np.arange(self._static_carrier + 1)
+        segment = np.arange(self.static_carrier + 1)
         segment[self._cuts[:, 0].astype(int)] = self._cuts[:, 1].astype(int)
         gone = {(int(model.leaf_body[k]), model.leaf_base[k].tobytes()) for k in leaves.tolist()}
         rows = np.flatnonzero((organ == int(Organ.LEAF)) & np.isin(segment[carrier], model.leaf_body[leaves]))
@@ -513,7 +513,7 @@ class Primitives:
                 self._rigid[key] = visual.shapes, layout
             known[key] = self._rigid[key]
             if (layout := known[key][1]) is not None:
-                found.append((self._static_carrier + 1 + number, layout))
+                found.append((self.static_carrier + 1 + number, layout))
         self._rigid = known
         return found
 
@@ -624,7 +624,7 @@ class Primitives:
         dirty = self._clusters_of(np.concatenate([trees, len(self.model.tree_first) + pieces]))
         if len(changed):
             dirty = np.union1d(dirty, np.flatnonzero(np.isin(self.cluster_bunch, changed)))
-        first_visual = self._static_carrier + 1
+        first_visual = self.static_carrier + 1
         if new_visuals or not np.array_equal(self._poses[first_visual:], visual_q):
             dirty = np.concatenate([dirty, self.rigid_clusters])
         if len(dirty):
