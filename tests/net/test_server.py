@@ -33,6 +33,7 @@ from vinesim.net.codec.messages import Counters
 from vinesim.net.pace import PaceReport
 from vinesim.net.replication.retained_sync import RetainedSync
 from vinesim.net.server import retained_store
+from vinesim.net.server import server as server_module
 from vinesim.net.server.admission import SceneId
 from vinesim.net.server.retained_store import Quota
 from vinesim.net.server.server import PortTaken, Server
@@ -218,6 +219,21 @@ def test_a_router_of_another_program_is_no_server(tokens, words, is_live):
     assert "\n" not in str(caught.value)
     del declared, others
     close_session(router)
+
+
+def test_a_client_waits_for_a_server_that_is_too_busy_to_answer_at_once(monkeypatch, caplog):
+    """The server answers nothing until the client says that it waits, longer than a server that is not there has."""
+    answer = server_module._on_server_query
+
+    def late(query: zenoh.Query) -> None:
+        if "is slow" in caplog.text:
+            answer(query)
+
+    monkeypatch.setattr(server_module, "_on_server_query", late)
+    with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
+        ada.join(hello("ada"))
+        wait(lambda: server.actors == ["vineyard/ada"], "ada")
+    assert caplog.text.count("is slow") == 1
 
 
 def watched(caplog: pytest.LogCaptureFixture) -> list[str]:
@@ -438,6 +454,7 @@ def test_records_wait_until_an_actor_is_admitted_to_their_world(monkeypatch):
 
 SERVE = """
 import pathlib, sys
+from vinesim.net.server import server as zenoh_server
 from vinesim.net.server.server import Server
 with Server(sys.argv[1], state_folder=pathlib.Path(sys.argv[2])) as server:
     print(server.endpoint, flush=True)

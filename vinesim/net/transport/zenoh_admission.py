@@ -18,12 +18,15 @@ from vinesim.audio.hearing import SpectatorsSpeakTo
 from vinesim.net.codec.control import Welcome, decode_welcome
 from vinesim.net.codec.header import PROTOCOL, MessageError, WrongVersion
 from vinesim.net.transport.bus import JoinRejected
-from vinesim.net.transport.zenoh_session import CONNECT_TIMEOUT, NoServer, has_match
+from vinesim.net.transport.zenoh_session import CONNECT_TIMEOUT, NoServer, ServerUnreachable, has_match
 
 log = logging.getLogger(__name__)
 
 RETRY_PERIOD = 0.05
 """Time between two attempts to reach a server that has just started, or was restarted [s]."""
+
+SLOW_TIMEOUT = 28.0
+"""Further time for a server that is there and does not answer, on a machine that is overloaded [s]."""
 
 REJOIN_TIMEOUT = 60.0
 """Time for which the server may refuse a session that replaces another one [s]. It forgets a silent session after its
@@ -92,17 +95,31 @@ class ServerAdmission:
     def find_server(self) -> None:
         """Return when a server of vinesim has answered, which may keep this world or only route.
 
-        Raises :class:`NoServer` if a router answers, but no server does within :data:`CONNECT_TIMEOUT`; with
-        certificates :class:`JoinRejected`, because a server does not answer names without a certificate in its folder.
+        A server of which the router knows, but whose program is too busy to answer, has :data:`SLOW_TIMEOUT` more.
+
+        Raises :class:`NoServer` if a router answers, but no server does within :data:`CONNECT_TIMEOUT`;
+        :class:`ServerUnreachable` if a server stays too slow; with certificates :class:`JoinRejected`, because a server
+        does not answer names without a certificate in its folder.
         """
+        querier = self._session.declare_querier(self._server_key)
         deadline = time.monotonic() + CONNECT_TIMEOUT
+        is_slow = False
         while not any(reply.ok is not None for reply in self._session.get(self._server_key, timeout=CONNECT_TIMEOUT)):
-            if time.monotonic() > deadline:
-                if self._is_secured:
-                    raise self._unknown_name()
+            if time.monotonic() <= deadline:
+                time.sleep(RETRY_PERIOD)
+            elif is_slow:
+                waited = CONNECT_TIMEOUT + SLOW_TIMEOUT
+                raise ServerUnreachable(self._endpoint, "a server is there, but too busy to answer", waited)
+            elif has_match(querier):
+                log.warning("%s: the server at %s is slow; waits for its answer", self._name, self._endpoint)
+                deadline += SLOW_TIMEOUT
+                is_slow = True
+            elif self._is_secured:
+                raise self._unknown_name()
+            else:
                 tokens = self._session.liveliness().get(ROS_TOKENS, timeout=CONNECT_TIMEOUT)
                 raise NoServer(self._endpoint, sum(reply.ok is not None for reply in tokens))
-            time.sleep(RETRY_PERIOD)
+        querier.undeclare()
 
     def _unknown_name(self) -> JoinRejected:
         """Returns the error for an actor to which a server with certificates does not reply."""

@@ -113,10 +113,10 @@ class ZenohBus:
         ``tls/HOST:PORT`` or ``quic/HOST:PORT``. ``live``: whether to declare a liveliness token, without which others
         do not know of this actor. Which sessions are opened: :func:`endpoints.client_links`.
 
-        Raises :class:`ServerUnreachable` after two seconds without a server, :class:`NoServer` after two seconds at a
-        Zenoh router without one, :class:`JoinRejected` if the server does not know the certificate, :class:`NameTaken`
-        if another session holds the name, and :class:`vinesim.core.errors.UsageError` if the name, the world or the
-        endpoint is invalid.
+        Raises :class:`ServerUnreachable` after two seconds without a server, and after 30 s at a server that is too
+        busy to answer, :class:`NoServer` after two seconds at a Zenoh router without a server, :class:`JoinRejected` if
+        the server does not know the certificate, :class:`NameTaken` if another session holds the name, and
+        :class:`vinesim.core.errors.UsageError` if the name, the world or the endpoint is invalid.
         """
         for what, text in (("actor name", name), ("world", world)):
             if not is_valid_name(text):
