@@ -4,7 +4,7 @@ A step has the stages of :class:`vinesim.world.Physics`: both sides predict thei
 are found and solved together, both sides integrate. Nothing is copied between host and GPU during a step.
 
 What a client's world has and a batch does not: contacts between plants, wires and arms that deform, hands of people,
-wood that breaks or is cut (except peduncles that a blade cuts), sleep, and bunches with moving berry clusters.
+wood that breaks, sleep, and bunches with moving berry clusters.
 """
 
 from __future__ import annotations
@@ -61,7 +61,8 @@ class Worlds:
         device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
         slots: number of contacts that the plants of one world can have at once. Further contacts are left out, and
             counted in :attr:`dropped`.
-        blade: the blade of one of the robots, which can cut peduncles. None: nothing is cut.
+        blade: the blade of one of the robots. It cuts peduncles, and canes of trees with spare bodies for the stumps
+            (:func:`vinesim.scene.spare_bodies.with_spares`), see :mod:`vinesim.worlds.cane_cuts`. None: nothing is cut.
         bunches: number of bunches that can come off in each world.
 
     Raises :class:`ValueError` if the number of trees does not fit or a tree needs substeps, or for a blade that a batch
@@ -103,8 +104,9 @@ class Worlds:
         self.faults = wp.zeros(count, dtype=wp.int32, device=device)
         """[world] What has gone wrong since the world's last reset: a sum of
         :data:`~vinesim.kernels.worlds.reset.MOTION` (a number is not finite, or a rate too high),
-        :data:`~vinesim.kernels.worlds.reset.ROOM` (contacts were left out) and
-        :data:`~vinesim.kernels.worlds.reset.BUNCHES` (a bunch was cut off for which the pool has no body). 0: nothing.
+        :data:`~vinesim.kernels.worlds.reset.ROOM` (contacts were left out),
+        :data:`~vinesim.kernels.worlds.reset.BUNCHES` (a bunch was cut off for which the pool has no body) and
+        :data:`~vinesim.kernels.worlds.reset.STUMPS` (a cane was cut whose tree has no spare body left). 0: nothing.
         A world with a fault goes on as it can, until it is reset."""
         self.fault_count = wp.zeros(count, dtype=wp.int32, device=device)
         """[world] Number of times since the start that a world without faults got one."""
@@ -128,6 +130,7 @@ class Worlds:
         of_worlds = []
         if self.pool is not None:
             state += self.pool.of_trees()
+            launches += self.pool.canes.restore_flags(self._resets)
             of_worlds += [_as_table(array) for array in self.pool.of_worlds()]
         for array, tree in state:
             rows = _as_table(array)
