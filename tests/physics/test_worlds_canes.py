@@ -68,8 +68,8 @@ def poses(worlds: Worlds) -> np.ndarray:
 def test_a_shoot_falls_with_its_bunch_and_lies_down_as_in_a_client(
     seed: int, segment: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A shoot swings, and a blade that stands still cuts it. One second: the shoot falls to the ground and
-    lies. What lies does not rock in a client, which a batch leaves out. From the second blow on, rounding errors grow."""
+    """A shoot swings, and a blade that stands still cuts it. One second: the shoot falls to the ground and lies. What
+    lies does not rock in a client, which a batch leaves out. From the second blow on, rounding errors grow."""
     monkeypatch.setattr("vinesim.world.ROCKING_TIME", np.inf)
     rng = np.random.default_rng(seed)
     model = with_spares(shoots(1, rng, 1.2))

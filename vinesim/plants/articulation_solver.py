@@ -102,6 +102,8 @@ class Beside(NamedTuple):
     """Launches what runs beside the prediction of the trees."""
     integrate: Callable[[], None]
     """Launches what runs beside their integration."""
+    end: Callable[[], None] = _launch_nothing
+    """Launches what runs after each step, alone."""
 
 
 _NOTHING_BESIDE = Beside(_launch_nothing, _launch_nothing)
@@ -2439,6 +2441,7 @@ class StepRunner:
             between()
             self._integrate(step)
             beside.integrate()
+            beside.end()
 
     def _steps_on_two_streams(self, steps: int, between: Callable[[], None], beside: Beside) -> None:
         """Take steps on a GPU with the trees on a second stream, beside what ``beside`` launches.
@@ -2458,6 +2461,7 @@ class StepRunner:
                 self._integrate(step)
             beside.integrate()
             stream.wait_stream(self._second_stream)
+            beside.end()
 
     @functools.cached_property
     def _second_stream(self) -> wp.Stream:

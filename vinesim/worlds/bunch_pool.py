@@ -33,6 +33,7 @@ from vinesim.scene.model import Model
 from vinesim.scene.spare_bodies import PLACE_STEP
 from vinesim.worlds.batch_contacts import BatchContacts
 from vinesim.worlds.cane_cuts import CaneCuts
+from vinesim.worlds.overload import Overload
 from vinesim.worlds.rigid_batch import RigidBatch
 
 OWN = tuple(struct_fields(kernels.WarpModel))
@@ -52,9 +53,10 @@ class BunchPool:
         plants: trees of all worlds.
         bodies: rigid bodies of all worlds; :func:`add_pool` has added the pool.
         contacts: contacts of the plants.
-        blade: the blade, a ``bypass`` or ``anvil`` blade that closes within a step.
+        blade: the blade, a ``bypass`` or ``anvil`` blade that closes within a step. None: nothing is cut.
         faults: [world] faults, see :attr:`vinesim.worlds.worlds.Worlds.faults`.
         fault_count: [world] number of times that a world without faults got one.
+        breaks: whether peduncles break under their load.
 
     Raises :class:`ValueError` for another blade.
     """
@@ -64,13 +66,14 @@ class BunchPool:
         plants: ArticulationSolver,
         bodies: RigidBatch,
         contacts: BatchContacts,
-        blade: Blade,
+        blade: Blade | None,
         faults: wp.array,
         fault_count: wp.array,
+        *,
+        breaks: bool = False,
     ) -> None:
-        if np.isfinite(blade.speed) or blade.kind == "saw":
-            raise ValueError(f"a {blade.kind} blade with {blade.speed:g} m/s: a batch has blades that close at once")
-        bodies.rigid.link_pose(blade.actor, blade.link)  # raises an error if there is no such link
+        if blade is not None:
+            _check(blade, bodies)
         self._plants = plants
         self._bodies = bodies
         self._contacts = contacts
@@ -96,18 +99,23 @@ class BunchPool:
         """Where the bodies of the pool are in mujoco_warp's arrays, for kernels."""
         self.hold = KernelGraph(hold, device=str(self._device))
         """Launches the kernel that holds unused bodies at their places. Call it before each step's first half."""
-        self.canes = CaneCuts(plants, bodies.count, contacts.capsules, contacts.is_cut)
+        stumps = 0 if blade is None else int(model.tree_spares.min())
+        self.canes = CaneCuts(plants, bodies.count, stumps, contacts.capsules, contacts.is_cut)
         """The parts of canes that have been cut."""
         cuts = self._cuts(bunches)
-        self.update = KernelGraph(
-            self._move_plants(),
-            self._close(blade, cuts),
-            self._detach(cuts, faults, fault_count),
-            *self.canes.cut(cuts, self._masses, faults, fault_count),
-            device=str(self._device),
-        )
+        move = self._move_plants()
+        detach = self._detach(cuts, faults, fault_count)
+        closing = []
+        if blade is not None:
+            closing = [self._close(blade, cuts), detach, *self.canes.cut(cuts, self._masses, faults, fault_count)]
+        self.update = KernelGraph(move, *closing, device=str(self._device))
         """Launches the kernels that close blades and detach bunches, and that compute the poses of all plants, at the
         end of a step. mujoco_warp's poses must be those of the end of the step."""
+        self.overload = Overload(plants, bodies.count, contacts.parameters, self._wood) if breaks else None
+        """Peduncles that break; None if none does."""
+        breaking = [] if self.overload is None else [*self.overload.find(cuts, self.is_free), move, detach]
+        self.end_step = KernelGraph(*breaking, device=str(self._device))
+        """Launches the kernels that detach bunches whose peduncles break, after the integration of each step."""
 
     def _zeros(self, dtype: Any, *shape: int) -> wp.array:
         return wp.zeros(shape, dtype=dtype, device=self._device)
@@ -256,9 +264,16 @@ class BunchPool:
         return [
             *rows,
             *self.canes.of_trees(),
+            *([] if self.overload is None else self.overload.of_trees()),
             (contacts.free.passing, self._array(np.arange(trees), wp.int32)),
             (self.is_free, self._array(model.body_tree[model.bunch_body], wp.int32)),
         ]
+
+
+def _check(blade: Blade, bodies: RigidBatch) -> None:
+    if np.isfinite(blade.speed) or blade.kind == "saw":
+        raise ValueError(f"a {blade.kind} blade with {blade.speed:g} m/s: a batch has blades that close at once")
+    bodies.rigid.link_pose(blade.actor, blade.link)  # raises an error if there is no such link
 
 
 def parking_pose(slot: int) -> np.ndarray:

@@ -37,17 +37,19 @@ class CaneCuts:
         worlds: number of worlds.
         capsules: collision capsules of the trees, see
             :attr:`vinesim.worlds.batch_contacts.BatchContacts.capsules`.
+        cuts: number of cuts that each tree can have; 0: nothing is cut.
         is_cut: [body] bool, at the bodies' places in the kernels' arrays: whether a body has been cut off.
     """
 
-    def __init__(self, plants: ArticulationSolver, worlds: int, capsules: Capsules, is_cut: wp.array) -> None:
+    def __init__(
+        self, plants: ArticulationSolver, worlds: int, cuts: int, capsules: Capsules, is_cut: wp.array
+    ) -> None:
         self._plants = plants
         self._worlds = worlds
         self._capsules = capsules
         self._is_cut = is_cut
         model = plants.model
-        self.cuts = int(model.tree_spares.min())
-        """Number of cuts that each tree can have."""
+        self.cuts = cuts
         self._canes = self._take_parts(model)
         if self.cuts:
             plants.let_kernels_cut(self.cuts)

@@ -14,6 +14,8 @@ CANE = wp.constant(1)
 PEDUNCLE = wp.constant(2)
 """Kinds of bodies that blades cut, see :class:`Wood`."""
 NONE = wp.constant(-1)
+WHOLE = wp.constant(-2)
+"""A cut at the joint of the bunch itself, which leaves all of its stalk on the vine."""
 
 
 @wp.struct
@@ -93,7 +95,8 @@ class Cuts:
     """[tree] m."""
 
     segment: wp.array(dtype=wp.int32)
-    """[bunch] Body of the segment of its peduncle that is cut; -1: the bunch hangs on, or has left."""
+    """[bunch] Body of the segment of its peduncle that is cut; -1: the bunch hangs on, or has left; -2: see
+    :data:`WHOLE`."""
     at: wp.array(dtype=wp.float64)
     """[bunch] m, place of the cut along the segment."""
     force: wp.array(dtype=wp.float64)
