@@ -121,6 +121,7 @@ def test_a_finger_that_presses_a_bud_costs_its_force(environment: Any) -> None:
         action = np.zeros((2, 8), np.float32)
         action[:, :7] = towards(environment, bud, 8.0, np.tile([1.0, 0.0, 0.0], (2, 1)))
         observation, reward, _, _, _ = environment.step(action)
+        assert (reward < -0.02 * observation[:, 24]).all()
         most = np.maximum(most, observation[:, 24])
     assert (most > 0.5).any()
 

@@ -1,4 +1,4 @@
-"""The arm of the learning tasks: seven joints and two fingers, on a base that is bolted down, and blades for picking and pruning.
+"""The arm of the learning tasks: seven joints and two fingers, on a base that is bolted down, and its blades.
 
 Lengths, masses and limits are those of no product. They are GUESSED in the range of arms that carry 3 kg.
 """
