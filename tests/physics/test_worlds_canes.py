@@ -65,12 +65,9 @@ def poses(worlds: Worlds) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("seed", "segment"), [(1, 4), (2, 2), (3, 0)])
-def test_a_shoot_falls_with_its_bunch_and_lies_down_as_in_a_client(
-    seed: int, segment: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A shoot swings, and a blade that stands still cuts it. One second: the shoot falls to the ground and lies. What
-    lies does not rock in a client, which a batch leaves out. From the second blow on, rounding errors grow."""
-    monkeypatch.setattr("vinesim.world.ROCKING_TIME", np.inf)
+def test_a_shoot_falls_with_its_bunch_and_lies_down_as_in_a_client(seed: int, segment: int) -> None:
+    """A shoot swings, and a blade that stands still cuts it. One second: the shoot falls to the ground and lies. From
+    the second blow on, rounding errors grow."""
     rng = np.random.default_rng(seed)
     model = with_spares(shoots(1, rng, 1.2))
     robot = arm((0.0, 0.0, 0.6))

@@ -1,10 +1,11 @@
-"""Peduncles break under their load in batches of worlds as in a client."""
+"""Peduncles and canes break under their load in batches of worlds as in a client."""
 
 import numpy as np
 import pytest
 
 from tests.physics.test_worlds import PARAMETERS
 from tests.physics.test_worlds_cutting import pose_in_client, poses_in_batch
+from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.world import Physics
 
@@ -74,19 +75,32 @@ def test_a_peduncle_breaks_in_the_step_and_at_the_end_of_a_client(
 
 
 @pytest.mark.slow
-def test_many_steps_in_one_call_break_as_single_steps_do_and_a_reset_world_repeats_it() -> None:
-    model = weak(1, 4.0, 5.0)
+@pytest.mark.parametrize(("pull", "strength"), [(4.0, 0.0), (500.0, 4e7)])
+def test_many_steps_in_one_call_break_as_single_steps_do_and_reset_worlds_repeat_them(
+    pull: float, strength: float
+) -> None:
+    """Peduncles break, or canes."""
+    model = weak(1, pull, 5.0 if pull < 5.0 else 500.0)
+    model.body_strength[model.body_organ == int(Organ.CANE)] = strength
+    model.body_toughness[:] = 1e3
     worlds = Worlds(plants_of_worlds([model], 2), 2, robots=[ROBOT], parameters=PARAMETERS, breaks=True)
     assert worlds.pool is not None
-    start = np.tile(np.random.default_rng(1).normal(0.0, 1.0, (len(model.body_mass), 3)), (2, 1))
+    rate = 1.0 if pull < 5.0 else 6.0
+    start = np.tile(np.random.default_rng(1).normal(0.0, rate, (len(model.body_mass), 3)), (2, 1))
     _set_in_motion(worlds, start)
     for _ in range(60):
         worlds.step()
-    first = poses_in_batch(worlds).copy()
+    worlds.download()
+    first = poses_in_batch(worlds).copy(), worlds.plants.state.joint_q.copy(), worlds.plants._parent.copy()
     _set_in_motion(worlds, start)
+    assert (worlds.plants._root < 0).all()
     worlds.step(60)
-    np.testing.assert_array_equal(poses_in_batch(worlds), first)
-    assert worlds.pool.is_free.numpy().tolist() == [1, 1]
+    worlds.download()
+    again = poses_in_batch(worlds), worlds.plants.state.joint_q, worlds.plants._parent
+    for one, other in zip(first, again, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert worlds.pool.is_free.numpy().all() == (pull < 5.0)
+    assert (worlds.plants._root >= 0).any() == (strength > 0.0)
 
 
 def _set_in_motion(worlds: Worlds, start: np.ndarray) -> None:
@@ -95,3 +109,47 @@ def _set_in_motion(worlds: Worlds, start: np.ndarray) -> None:
     worlds.download()
     worlds.plants.state.joint_qd[:] = start
     worlds.plants.upload()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("seed", "strength", "toughness", "rate", "steps", "broken"),
+    [
+        pytest.param(1, 4e7, 1e3, 6.0, 30, True, id="brittle wood breaks"),
+        pytest.param(2, 6e7, 2e5, 6.0, 50, False, id="tough wood keeps a set"),
+        pytest.param(3, 3e7, 5e3, 8.0, 50, True, id="wood cracks and breaks"),
+    ],
+)
+def test_a_cane_keeps_a_set_and_breaks_at_the_joint_and_in_the_step_of_a_client(
+    seed: int, strength: float, toughness: float, rate: float, steps: int, broken: bool
+) -> None:
+    """Up to the first blow on the ground, or half a second. The shoot of the first world swings wildly, that of the second hangs
+    still."""
+    model = weak(seed, 500.0, 500.0)
+    cane = model.body_organ == int(Organ.CANE)
+    model.body_strength[cane] = strength
+    model.body_yield_strength[cane] = 0.6 * strength
+    model.body_toughness[cane] = toughness
+    physics = Physics(model, parameters=PARAMETERS)
+    physics.contact_solver.plant_plant_contacts = False
+    physics.add_robot(ROBOT)
+    physics.wake(np.arange(1))
+    start = np.random.default_rng(seed).normal(0.0, rate, physics.state.joint_qd.shape)
+    physics.state.joint_qd[:] = start
+    worlds = Worlds(plants_of_worlds([model], 2), 2, robots=[ROBOT], parameters=PARAMETERS, breaks=True)
+    assert worlds.pool is not None
+    worlds.plants.state.joint_qd[:] = np.concatenate([start, np.zeros_like(start)])
+    worlds.plants.upload()
+    parted = 0
+    for _ in range(steps):
+        physics.step()
+        worlds.step()
+        parted += len(physics.detachments)
+        physics.update_kinematics()
+        worlds.download()
+        bodies = len(model.body_mass)
+        np.testing.assert_array_equal(worlds.plants._parent[:bodies], physics.plants._parent)
+        np.testing.assert_allclose(worlds.plants.state.body_q[:bodies, :3], physics.state.body_q[:, :3], atol=1e-4)
+    assert (parted > 0) == broken
+    assert physics.state.joint_flow.max() > 0.01 or broken
+    assert not worlds.faults.numpy().any()

@@ -86,6 +86,9 @@ _COUNTS = 9
 """Length of the array of counts. The entry :data:`_NEXT_LEVEL` is the number of the next substep, the entry
 :data:`_LEVELS` the number of substeps of the step."""
 
+ROCKING_TIME = 0.3
+"""[s] Time constant with which cut wood on the ground, a wire or a post stops to turn. GUESSED: contacts have no
+resistance to rolling, and a bent cane that lies on two points would rock for minutes."""
 _log = logging.getLogger(__name__)
 _NO_TREES = np.zeros(0, np.int32)
 _NO_WRENCHES = np.zeros((0, 6), np.float32)

@@ -56,7 +56,7 @@ class BunchPool:
         blade: the blade, a ``bypass`` or ``anvil`` blade that closes within a step. None: nothing is cut.
         faults: [world] faults, see :attr:`vinesim.worlds.worlds.Worlds.faults`.
         fault_count: [world] number of times that a world without faults got one.
-        breaks: whether peduncles break under their load.
+        breaks: whether wood breaks under its load.
 
     Raises :class:`ValueError` for another blade.
     """
@@ -100,7 +100,7 @@ class BunchPool:
         self.hold = KernelGraph(hold, device=str(self._device))
         """Launches the kernel that holds unused bodies at their places. Call it before each step's first half."""
         stumps = 0 if blade is None else int(model.tree_spares.min())
-        self.canes = CaneCuts(plants, bodies.count, stumps, contacts.capsules, contacts.is_cut)
+        self.canes = CaneCuts(plants, bodies.count, contacts, stumps, breaks=breaks)
         """The parts of canes that have been cut."""
         cuts = self._cuts(bunches)
         move = self._move_plants()
@@ -111,11 +111,17 @@ class BunchPool:
         self.update = KernelGraph(move, *closing, device=str(self._device))
         """Launches the kernels that close blades and detach bunches, and that compute the poses of all plants, at the
         end of a step. mujoco_warp's poses must be those of the end of the step."""
-        self.overload = Overload(plants, bodies.count, contacts.parameters, self._wood) if breaks else None
-        """Peduncles that break; None if none does."""
-        breaking = [] if self.overload is None else [*self.overload.find(cuts, self.is_free), move, detach]
-        self.end_step = KernelGraph(*breaking, device=str(self._device))
-        """Launches the kernels that detach bunches whose peduncles break, after the integration of each step."""
+        self.overload = None
+        """Wood that gives under its load; None if none does."""
+        breaking = []
+        if breaks:
+            self.overload = Overload(plants, bodies.count, contacts.parameters, self._wood, self.canes.topology)
+            part = self.canes.part(self.overload.breaks, faults, fault_count)
+            breaking = [*self.overload.find(cuts, self.is_free), move, detach, *part]
+        ending = [*self.canes.slow_lying_parts(), *breaking]
+        self.end_step = KernelGraph(*ending, device=str(self._device)) if ending else None
+        """Launches the kernels that slow what lies, and part what breaks, after the integration of each step; None if
+        there are none."""
 
     def _zeros(self, dtype: Any, *shape: int) -> wp.array:
         return wp.zeros(shape, dtype=dtype, device=self._device)

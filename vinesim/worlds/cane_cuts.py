@@ -1,4 +1,4 @@
-"""Canes that blades cut in a batch of worlds.
+"""Canes that blades cut in a batch of worlds, and canes that break.
 
 What is beyond a cut falls as a floating component of its tree, and the stump stays, as in a client. A cut takes one of
 the tree's spare bodies (:mod:`vinesim.scene.spare_bodies`), so a tree can be cut as often as it has such bodies.
@@ -10,23 +10,29 @@ cane. A short stump takes whole steps, however fast its first mode is.
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
 import warp as wp
 
 from vinesim.contact.plant_capsules import plant_capsules
 from vinesim.core import frames
-from vinesim.kernels.contact.structs import Capsules
 from vinesim.kernels.graph import KernelLaunch
 from vinesim.kernels.plants import structs
 from vinesim.kernels.worlds import cane_cuts as kernels
 from vinesim.kernels.worlds.cutting import Canes, Cuts
 from vinesim.kernels.worlds.free_bunches import PlantMasses
 from vinesim.kernels.worlds.reset import restore_flags
-from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.plants.articulation_solver import ROCKING_TIME, ArticulationSolver
 from vinesim.plants.segment_parts import CLAMPED, SHORTEST, own_share, rod_of
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spare_bodies import PLACE_STEP
+from vinesim.worlds.batch_contacts import BatchContacts
+
+BREAKS = 2
+"""Number of times that each tree can break under its load, at least. GUESSED"""
 
 
 class CaneCuts:
@@ -35,25 +41,27 @@ class CaneCuts:
     Args:
         plants: trees of all worlds.
         worlds: number of worlds.
-        capsules: collision capsules of the trees, see
-            :attr:`vinesim.worlds.batch_contacts.BatchContacts.capsules`.
-        cuts: number of cuts that each tree can have; 0: nothing is cut.
-        is_cut: [body] bool, at the bodies' places in the kernels' arrays: whether a body has been cut off.
+        contacts: contacts of the trees.
+        spares: number of spare bodies of each tree for stumps that blades leave; 0: no cane is cut.
+        breaks: whether canes break under their load.
     """
 
     def __init__(
-        self, plants: ArticulationSolver, worlds: int, cuts: int, capsules: Capsules, is_cut: wp.array
+        self, plants: ArticulationSolver, worlds: int, contacts: BatchContacts, spares: int, *, breaks: bool
     ) -> None:
         self._plants = plants
         self._worlds = worlds
-        self._capsules = capsules
-        self._is_cut = is_cut
+        self._contacts = contacts
+        self._is_cut = contacts.is_cut
+        self._spares = spares
         model = plants.model
-        self.cuts = cuts
+        self.cuts = max(spares, BREAKS if breaks else 0)
+        """Number of cuts and breaks that each tree can have."""
         self._canes = self._take_parts(model)
         if self.cuts:
             plants.let_kernels_cut(self.cuts)
-            self._topology = self._take_topology()
+            self.topology = self._take_topology()
+            """What cuts change, for kernels."""
 
     @property
     def parts(self) -> tuple[Canes, wp.array]:
@@ -63,20 +71,46 @@ class CaneCuts:
     def cut(self, cuts: Cuts, masses: PlantMasses, faults: wp.array, fault_count: wp.array) -> list[KernelLaunch]:
         """Returns the launches that make the cuts of canes in ``cuts``, at the end of a step. ``masses``: those of the
         trees. ``faults``, ``fault_count``: see :class:`~vinesim.worlds.bunch_pool.BunchPool`."""
+        if not self._spares:
+            return []
+        given = [self._numbers(), self._whole_wood(), cuts]
+        written = [self._canes, faults, fault_count, masses, self._contacts.capsules, self.topology, *self._state()]
+        return [KernelLaunch(kernels.cut_canes, given, written, threads=self._worlds)]
+
+    def part(self, breaks: wp.array, faults: wp.array, fault_count: wp.array) -> list[KernelLaunch]:
+        """Returns the launches that part canes at the joints ``breaks`` bool [body], at the end of a step; see
+        :meth:`cut`."""
         if not self.cuts:
             return []
+        written = [faults, fault_count, self.topology, *self._state()]
+        return [KernelLaunch(kernels.part_canes, [self._numbers(), breaks], written, threads=self._worlds)]
+
+    def slow_lying_parts(self) -> list[KernelLaunch]:
+        """Returns the launches that let what was cut off and lies rock no longer than in a client, after the
+        integration of each step."""
+        if not self.cuts:
+            return []
+        arrays = self._plants.launches.resident_arrays
+        share = math.exp(-self._plants.dt / ROCKING_TIME)
+        given = [share, self.cuts, self._worlds, self._contacts.geoms, arrays["body_root"], self.topology]
+        given += self._contacts.lists()
+        trees = len(self._plants.model.tree_first)
+        return [KernelLaunch(kernels.slow_lying_parts, given, [arrays["joint_qd"]], threads=trees)]
+
+    def _numbers(self) -> kernels.CaneNumbers:
         numbers = kernels.CaneNumbers()
         numbers.worlds = self._worlds
         numbers.trees = len(self._plants.model.tree_first)
         numbers.cuts = self.cuts
+        numbers.spares = self._spares
         numbers.shortest = SHORTEST
         numbers.place_step = PLACE_STEP
         numbers.clamped = CLAMPED
+        return numbers
+
+    def _state(self) -> list[Any]:
         fill = self._plants.launches.fill_resident
-        state = [fill(structs.ArticulationModel), fill(structs.BodyState), fill(structs.JointState)]
-        given = [numbers, self._whole_wood(), cuts]
-        written = [self._canes, faults, fault_count, masses, self._capsules, self._topology, *state]
-        return [KernelLaunch(kernels.cut_canes, given, written, threads=self._worlds)]
+        return [fill(structs.ArticulationModel), fill(structs.BodyState), fill(structs.JointState)]
 
     # ------------------------------------------------------------------ state, for resets
 
@@ -89,12 +123,13 @@ class CaneCuts:
         trees = np.arange(len(self._plants.model.tree_first))
         names = ("body_parent", "body_root", "body_offset", "body_rest", "joint_stiffness", "joint_damping")
         rows = [arrays[name] for name in names] + [getattr(self._canes, name) for name in ("segment", "start", "end")]
+        rows += [self.topology.grown, self.topology.kept]
         of_root = self._array(np.repeat(trees, self.cuts), wp.int32)
         return [
             *((row, arrays["body_tree"]) for row in rows),
-            (self._topology.moving, self._array(trees, wp.int32)),
-            (self._topology.budget, self._array(trees, wp.int32)),
-            (self._topology.roots, of_root),
+            (self.topology.moving, self._array(trees, wp.int32)),
+            (self.topology.budget, self._array(trees, wp.int32)),
+            (self.topology.roots, of_root),
         ]
 
     def restore_flags(self, resets: wp.array) -> list[KernelLaunch]:
@@ -103,7 +138,7 @@ class CaneCuts:
         if not self.cuts:
             return []
         arrays = self._plants.launches.resident_arrays
-        flags = (arrays["body_falls"], self._topology.branches, self._topology.is_cut)
+        flags = (arrays["body_falls"], self.topology.branches, self.topology.is_cut)
         given = [self._worlds, resets, arrays["body_tree"]]
         return [
             KernelLaunch(restore_flags, [*given, wp.clone(flag)], [flag], threads=flag.shape[0], block=128)
@@ -128,7 +163,7 @@ class CaneCuts:
         is_cane[model.leaf_body] = False
         is_tied = np.zeros(len(model.tree_first), bool)
         is_tied[model.body_tree[model.tie_body]] = True
-        return is_cane & ~is_tied[model.body_tree] & (self.cuts > 0)
+        return is_cane & ~is_tied[model.body_tree] & (self._spares > 0)
 
     def _take_parts(self, model: Model) -> Canes:
         slots = self._plants.buffers.slots.astype(np.int32)
@@ -149,6 +184,9 @@ class CaneCuts:
         topology.roots = arrays["floating"][: self.cuts * len(self._plants.model.tree_first)]
         topology.branches = arrays["body_branches"]
         topology.is_cut = self._is_cut
+        topology.grown = wp.clone(arrays["body_rest"])
+        identity = np.tile(frames.IDENTITY, (len(topology.grown), 1)).astype(np.float32)
+        topology.kept = self._array(identity, wp.quat)
         return topology
 
     def _whole_wood(self) -> kernels.WholeWood:

@@ -4,7 +4,7 @@ A step has the stages of :class:`vinesim.world.Physics`: both sides predict thei
 are found and solved together, both sides integrate. Nothing is copied between host and GPU during a step.
 
 What a client's world has and a batch does not: contacts between plants, wires and arms that deform, hands of people,
-canes that break, sleep, and bunches with moving berry clusters.
+sleep, and bunches with moving berry clusters.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Worlds:
         blade: the blade of one of the robots. It cuts peduncles, and canes of trees with spare bodies for the stumps
             (:func:`vinesim.scene.spare_bodies.with_spares`), see :mod:`vinesim.worlds.cane_cuts`. None: nothing is cut.
         bunches: number of bunches that can come off in each world.
-        breaks: whether peduncles break under their load, after ``detachment_duration`` as in a client. Canes do not.
+        breaks: whether peduncles and canes break under their load, and canes keep a set, as in a client.
 
     Raises :class:`ValueError` if the number of trees does not fit or a tree needs substeps, or for a blade that a batch
     cannot have (see :class:`~vinesim.worlds.bunch_pool.BunchPool`),
@@ -190,7 +190,7 @@ class Worlds:
     def step(self, steps: int = 1) -> None:
         """Advance all worlds by ``steps`` steps."""
         beside = Beside(self._predict_bodies, self.bodies.integrate)
-        if self.pool is not None and self.pool.overload is not None:
+        if self.pool is not None and self.pool.end_step is not None:
             beside = beside._replace(end=self.pool.end_step)
         self.plants.advance(steps, self.contacts.solve, beside)
         self._check()

@@ -7,11 +7,12 @@ canes without leaves and ties. The changes of a tree's arrays are made on the de
 import warp as wp
 
 from vinesim.kernels.contact.body_motion import to_double, to_single
-from vinesim.kernels.contact.structs import Capsules
+from vinesim.kernels.contact.structs import Capsules, Contacts, Geoms
 from vinesim.kernels.plants import energy_budget
 from vinesim.kernels.plants.structs import ArticulationModel, BodyState, JointState
 from vinesim.kernels.worlds.cutting import NONE, Canes, Cuts
 from vinesim.kernels.worlds.free_bunches import PlantMasses
+from vinesim.kernels.worlds.narrowphase import WorldContacts
 from vinesim.kernels.worlds.reset import STUMPS
 
 wp.set_module_options({"enable_backward": False})
@@ -26,7 +27,9 @@ class CaneNumbers:
     worlds: int
     trees: int
     cuts: int
-    """Largest number of cuts of a tree."""
+    """Largest number of cuts and breaks of a tree."""
+    spares: int
+    """Number of spare bodies of a tree."""
     shortest: wp.float64
     """[m] Least distance of a cut from the ends of a part."""
     place_step: wp.float64
@@ -87,6 +90,10 @@ class Topology:
     """[body] Whether a body has a child other than the next body."""
     is_cut: wp.array(dtype=wp.bool)
     """[body] Whether a body was cut off."""
+    grown: wp.array(dtype=wp.quat)
+    """[body] Rest rotation of each joint without its set."""
+    kept: wp.array(dtype=wp.quat)
+    """[body] Set of each joint, see :attr:`vinesim.scene.state.State.joint_set`."""
 
 
 @wp.func
@@ -141,8 +148,34 @@ def turn_by(rotation: wp.vec3d):
 
 
 @wp.func
+def turn_rest(
+    body: int,
+    grown: wp.quatd,
+    kept: wp.quatd,
+    topology_out: Topology,
+    model_out: ArticulationModel,
+    joints_out: JointState,
+):
+    """Give a joint a rest rotation without its set, and a set; its pose and motion do not change."""
+    before = double_quat(model_out.body_rest[body])
+    rest = wp.normalize(grown * kept)
+    turn = wp.quat_inverse(rest) * before
+    topology_out.grown[body] = single_quat(grown)
+    topology_out.kept[body] = single_quat(kept)
+    model_out.body_rest[body] = single_quat(rest)
+    joints_out.joint_q[body] = single_quat(wp.normalize(turn * double_quat(joints_out.joint_q[body])))
+    joints_out.joint_qd[body] = to_single(wp.quat_rotate(turn, to_double(joints_out.joint_qd[body])))
+
+
+@wp.func
 def adjust_joint(
-    body: int, clamped: wp.float64, canes: Canes, wood: WholeWood, model_out: ArticulationModel, joints_out: JointState
+    body: int,
+    clamped: wp.float64,
+    canes: Canes,
+    wood: WholeWood,
+    topology_out: Topology,
+    model_out: ArticulationModel,
+    joints_out: JointState,
 ):
     """Give the joint of the first part of a segment the spring of the wood that meets there; its pose does not change.
     See :func:`vinesim.plants.segment_parts.joint_compliance` and :func:`~vinesim.plants.segment_parts.relaxed_joint`.
@@ -160,13 +193,9 @@ def adjust_joint(
         compliance = clamped * own
     model_out.joint_stiffness[body] = wood.stiffness[segment] / wp.float32(compliance)
     model_out.joint_damping[body] = wood.damping[segment] / wp.float32(compliance)
-    before = double_quat(model_out.body_rest[body])
     relaxed = turn_by((one - compliance) * wood.settled[segment])
-    rest = wp.normalize(double_quat(wood.rest_turn[segment]) * relaxed)
-    turn = wp.quat_inverse(rest) * before
-    model_out.body_rest[body] = single_quat(rest)
-    joints_out.joint_q[body] = single_quat(wp.normalize(turn * double_quat(joints_out.joint_q[body])))
-    joints_out.joint_qd[body] = to_single(wp.quat_rotate(turn, to_double(joints_out.joint_qd[body])))
+    grown = wp.normalize(double_quat(wood.rest_turn[segment]) * relaxed)
+    turn_rest(body, grown, double_quat(topology_out.kept[body]), topology_out, model_out, joints_out)
 
 
 @wp.func
@@ -180,6 +209,7 @@ def cut_off(body: int, bodies: BodyState, topology_out: Topology, model_out: Art
         joints_out.joint_xd[body] = wp.spatial_top(motion)
         joints_out.joint_qd[body] = wp.spatial_bottom(motion)
         topology_out.is_cut[body] = True
+        topology_out.kept[body] = wp.quat_identity()
         model_out.body_parent[body] = -1
         model_out.body_offset[body] = wp.vec3()
         model_out.body_rest[body] = wp.quat_identity()
@@ -218,6 +248,8 @@ def leave_stump(
         model_out.body_parent[spare] = parent
         model_out.body_offset[spare] = wood.offset[segment]
         model_out.body_rest[spare] = model_out.body_rest[old]
+        topology_out.grown[spare] = topology_out.grown[old]
+        topology_out.kept[spare] = topology_out.kept[old]
         if parent >= 0:
             topology_out.branches[parent] = True
     canes_out.segment[spare] = segment
@@ -245,12 +277,12 @@ def leave_stump(
     used = (spare - model_out.tree_first[tree]) / model_out.pitch + 1
     topology_out.moving[tree] = wp.max(topology_out.moving[tree], used)
     if not topology_out.is_cut[spare]:
-        adjust_joint(spare, numbers.clamped, canes_out, wood, model_out, joints_out)
+        adjust_joint(spare, numbers.clamped, canes_out, wood, topology_out, model_out, joints_out)
     if old == segment:
         first = model_out.tree_first[tree]
         for k in range(first, first + topology_out.moving[tree] * model_out.pitch, model_out.pitch):
             if model_out.body_parent[k] == old:
-                adjust_joint(k, numbers.clamped, canes_out, wood, model_out, joints_out)
+                adjust_joint(k, numbers.clamped, canes_out, wood, topology_out, model_out, joints_out)
 
 
 @wp.func
@@ -272,11 +304,30 @@ def find_roots(tree: int, topology: Topology, model_out: ArticulationModel):
 def free_spare(tree: int, wood: WholeWood, canes: Canes, numbers: CaneNumbers, pitch: int):
     """Returns the first spare body of a tree that is no stump; -1: none."""
     found = int(NONE)
-    for i in range(numbers.cuts):
+    for i in range(numbers.spares):
         spare = wood.spare[tree] + i * pitch
         if found < 0 and canes.segment[spare] < 0:
             found = spare
     return found
+
+
+@wp.func
+def free_place(tree: int, cuts: int, topology: Topology):
+    """Returns the first free place of a tree in the list of floating roots; -1: none."""
+    found = int(NONE)
+    for i in range(cuts):
+        if found < 0 and topology.roots[tree * cuts + i] < 0:
+            found = tree * cuts + i
+    return found
+
+
+@wp.func
+def report_fault(world: int, faults_out: wp.array(dtype=wp.int32), fault_count_out: wp.array(dtype=wp.int32)):
+    """Give a world the fault :data:`~vinesim.kernels.worlds.reset.STUMPS`."""
+    before = faults_out[world]
+    faults_out[world] = before | STUMPS
+    if before == 0:
+        fault_count_out[world] = fault_count_out[world] + 1
 
 
 @wp.kernel
@@ -306,17 +357,12 @@ def cut_canes(
     for tree in range(world, numbers.trees, numbers.worlds):
         old = cuts.cane[tree]
         if old >= 0:
-            slot = int(0)
-            while slot < numbers.cuts and topology_out.roots[tree * numbers.cuts + wp.min(slot, numbers.cuts - 1)] >= 0:
-                slot = slot + 1
+            place = free_place(tree, numbers.cuts, topology_out)
             spare = free_spare(tree, wood, canes_out, numbers, model_out.pitch)
             at = cuts.cane_at[tree]
             splits = wood.growth[canes_out.segment[old]] >= wp.float32(at)
-            if slot == numbers.cuts or spare < 0:
-                before = faults_out[world]
-                faults_out[world] = before | STUMPS
-                if before == 0:
-                    fault_count_out[world] = fault_count_out[world] + 1
+            if place < 0 or spare < 0:
+                report_fault(world, faults_out, fault_count_out)
             elif splits or not topology_out.is_cut[old]:
                 root = int(old)
                 if splits:
@@ -343,5 +389,66 @@ def cut_canes(
                     )
                 cut_off(old, bodies_out, topology_out, model_out, joints_out)
                 find_roots(tree, topology_out, model_out)
-                topology_out.roots[tree * numbers.cuts + slot] = root
+                topology_out.roots[place] = root
                 topology_out.budget[tree] = NO_BUDGET
+
+
+@wp.kernel
+def part_canes(
+    # model
+    numbers: CaneNumbers,
+    # in
+    breaks: wp.array(dtype=wp.bool),
+    # out
+    faults_out: wp.array(dtype=wp.int32),
+    fault_count_out: wp.array(dtype=wp.int32),
+    topology_out: Topology,
+    model_out: ArticulationModel,
+    bodies_out: BodyState,
+    joints_out: JointState,
+):
+    """One thread per world. Part canes at the joints that ``breaks`` [body] lists. Faults as in :func:`cut_canes`."""
+    world = wp.tid()
+    for tree in range(world, numbers.trees, numbers.worlds):
+        first = model_out.tree_first[tree]
+        for k in range(first, first + topology_out.moving[tree] * model_out.pitch, model_out.pitch):
+            if breaks[k] and not topology_out.is_cut[k]:
+                place = free_place(tree, numbers.cuts, topology_out)
+                if place < 0:
+                    report_fault(world, faults_out, fault_count_out)
+                else:
+                    cut_off(k, bodies_out, topology_out, model_out, joints_out)
+                    find_roots(tree, topology_out, model_out)
+                    topology_out.roots[place] = k
+                    topology_out.budget[tree] = NO_BUDGET
+
+
+@wp.kernel
+def slow_lying_parts(
+    # model
+    share: float,
+    cuts: int,
+    worlds: int,
+    geoms: Geoms,
+    # in
+    body_root: wp.array(dtype=wp.int32),
+    topology: Topology,
+    contacts: Contacts,
+    world_contacts: WorldContacts,
+    # out
+    joint_qd_out: wp.array(dtype=wp.vec3),
+):
+    """One thread per tree, after an integration. Multiply the angular velocity of each cut-off part that pressed on
+    something static in the step by ``share``, as :meth:`ArticulationSolver.slow_turning` does."""
+    tree = wp.tid()
+    world = tree % worlds
+    first = world_contacts.first[tree]
+    for i in range(cuts):
+        root = topology.roots[tree * cuts + i]
+        lies = bool(False)
+        for c in range(first, first + world_contacts.of_tree[tree]):
+            at = c * worlds + world
+            presses = contacts.other[at] >= geoms.count[0] and wp.length_sq(contacts.force[at]) > wp.float64(0.0)
+            lies = lies or (presses and body_root[contacts.body[at]] == root)
+        if root >= 0 and lies:
+            joint_qd_out[root] = share * joint_qd_out[root]
