@@ -123,8 +123,8 @@ def _set_in_motion(worlds: Worlds, start: np.ndarray) -> None:
 def test_a_cane_keeps_a_set_and_breaks_at_the_joint_and_in_the_step_of_a_client(
     seed: int, strength: float, toughness: float, rate: float, steps: int, broken: bool
 ) -> None:
-    """Up to the first blow on the ground, or half a second. The shoot of the first world swings wildly, that of the second hangs
-    still."""
+    """Up to the first blow on the ground, or half a second. The shoot of the first world swings wildly, that of the
+    second hangs still."""
     model = weak(seed, 500.0, 500.0)
     cane = model.body_organ == int(Organ.CANE)
     model.body_strength[cane] = strength
