@@ -1,10 +1,14 @@
 """Peduncles and canes break under their load in batches of worlds as in a client."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from tests.physics.test_worlds import PARAMETERS
 from tests.physics.test_worlds_cutting import pose_in_client, poses_in_batch
+from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.plants.device_buffers import DeviceBuffers
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.world import Physics
@@ -101,6 +105,38 @@ def test_many_steps_in_one_call_break_as_single_steps_do_and_reset_worlds_repeat
         np.testing.assert_array_equal(one, other)
     assert worlds.pool.is_free.numpy().all() == (pull < 5.0)
     assert (worlds.plants._root >= 0).any() == (strength > 0.0)
+
+
+@pytest.mark.slow
+def test_wood_breaks_the_same_to_the_bit_in_the_order_of_bodies_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Peduncles break in some worlds and canes in others; four trees lie side by side in the kernels' arrays."""
+    models = [weak(1, 4.0, 5.0), weak(2, 500.0, 500.0), weak(3, 3.5, 500.0)]
+    models[1].body_strength[models[1].body_organ == int(Organ.CANE)] = 3e7
+    models[1].body_toughness[:] = 1e3
+
+    def moved() -> np.ndarray:
+        worlds = Worlds(plants_of_worlds(models, 6), 6, robots=[ROBOT], parameters=PARAMETERS, breaks=True)
+        assert worlds.pool is not None
+        bodies = len(models[0].body_mass)
+        start = np.random.default_rng(4).normal(0.0, 5.0, (6 * bodies, 3))
+        _set_in_motion(worlds, start)
+        seen = []
+        for _ in range(30):
+            worlds.step()
+            worlds.download()
+            seen.append(worlds.plants.state.body_q.copy())
+        assert worlds.pool.is_free.numpy()[[0, 3]].all()
+        fallen = worlds.pool.canes.parts[1].numpy()[worlds.plants.buffers.slots].reshape(6, bodies)
+        assert fallen.any(1).tolist() == [False, True, False, False, True, False]
+        return np.array(seen)
+
+    expected = moved()
+
+    def interleaved(*given: Any, device: str) -> ArticulationSolver:
+        return ArticulationSolver(*given, buffers=DeviceBuffers(device, 4))
+
+    monkeypatch.setattr("vinesim.worlds.worlds.ArticulationSolver", interleaved)
+    np.testing.assert_array_equal(expected, moved())
 
 
 def _set_in_motion(worlds: Worlds, start: np.ndarray) -> None:
