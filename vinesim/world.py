@@ -22,7 +22,7 @@ from vinesim.interaction.hand_grasp import GraspManager
 from vinesim.interaction.handwork import BoundTie, Handwork
 from vinesim.interaction.stalk import is_on_stalk
 from vinesim.interaction.support_tracking import SupportTracker
-from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.plants.articulation_solver import ROCKING_TIME, ArticulationSolver
 from vinesim.plants.fault_guard import FaultGuard
 from vinesim.plants.level_of_detail import LevelOfDetail
 from vinesim.plants.sleep import SleepMonitor
@@ -49,10 +49,6 @@ from vinesim.wind.plant_wind import WindOnPlants
 from vinesim.wires.deflected_wires import DeflectedWires
 from vinesim.wires.elastic_supports import ElasticSupports
 from vinesim.wires.wire_segments import WireShapes
-
-ROCKING_TIME = 0.3
-"""[s] Time constant with which cut wood on the ground, a wire or a post stops to turn. GUESSED: contacts have no
-resistance to rolling, and a bent cane that lies on two points would rock for minutes."""
 
 
 class Physics:

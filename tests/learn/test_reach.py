@@ -131,7 +131,7 @@ def test_arrays_on_the_device_have_the_numbers_of_those_of_numpy_and_are_no_copi
         on_device.step(wp.zeros((2, 6)))
 
 
-@pytest.mark.parametrize("task", ["Reach", "Expose", "Pick"])
+@pytest.mark.parametrize("task", ["Reach", "Expose", "Pick", "Prune"])
 def test_gymnasium_finds_no_fault_in_one_world(task):
     from gymnasium.utils.env_checker import check_env
 

@@ -15,6 +15,7 @@ from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.plants.device_buffers import DeviceBuffers
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.values import RobotSpec
 from vinesim.world import Physics
 
@@ -38,8 +39,8 @@ def blade(force: float = 200.0) -> Blade:
     return Blade("hand", "palm", MOUTH, HALF, force)
 
 
-def client(model: Model, robot: RobotSpec) -> Physics:
-    physics = Physics(model, parameters=PARAMETERS)
+def client(model: Model, robot: RobotSpec, parameters: PhysicsParameters = PARAMETERS) -> Physics:
+    physics = Physics(model, parameters=parameters)
     physics.contact_solver.plant_plant_contacts = False
     physics.add_robot(robot)
     physics.wake(np.arange(len(model.tree_first)))

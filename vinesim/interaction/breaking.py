@@ -96,13 +96,7 @@ class WoodMonitor:
         """[bunch, 2] Shares of the strengths of peduncles in tension and bending that cuts in part have left."""
         self._wrenches: dict[int, tuple[int, int, np.ndarray]] = {}
         """Tick, body and wrench of the overloaded end of each overloaded bunch in the last step."""
-        self.law = BendingLaw.of(
-            model.body_radius[:, 0],
-            model.joint_stiffness[:, 2],
-            model.body_strength,
-            model.body_yield_strength,
-            model.body_toughness,
-        )
+        self.law = cane_law(model)
         """[body] How the joints of canes give."""
         self._whole_law = self.law
         self._section = np.ones((count := len(model.body_mass), 2))
@@ -120,14 +114,7 @@ class WoodMonitor:
     def _bind(self) -> None:
         plants = self.plants
         model = plants.model
-        count = len(model.body_mass)
-        pull = np.full(count, np.inf, np.float32)
-        bend = np.ones(count, np.float32)
-        strong = model.body_strength > 0.0
-        pull[strong] = (model.body_strength * np.pi * model.body_radius[:, 0] ** 2)[strong]
-        for end in self._ends.T:
-            pull[end] = model.bunch_pull
-            bend[end] = model.bunch_bend
+        pull, bend = strengths(model, self._ends)
         buffers = plants.buffers
         self._stress = buffers.pinned(np.zeros((buffers.slot_count, 2), np.float32))
         self._watch = buffers.pinned(np.zeros(len(model.tree_first), np.int32))
@@ -367,6 +354,30 @@ class WoodMonitor:
             TWIST: 0.5 * math.sqrt(3.0) * abs(twist) / bend,
         }
         return max(shares, key=lambda cause: shares[cause])
+
+
+def cane_law(model: Model) -> BendingLaw:
+    """Returns how the joints of canes give [body]."""
+    return BendingLaw.of(
+        model.body_radius[:, 0],
+        model.joint_stiffness[:, 2],
+        model.body_strength,
+        model.body_yield_strength,
+        model.body_toughness,
+    )
+
+
+def strengths(model: Model, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the tension [body] N float32 at which the wood at each joint breaks, and the bending moment [body] N m at
+    which a peduncle breaks there; 1 for canes. ``ends``: see :func:`wood_kinds`."""
+    pull = np.full(len(model.body_mass), np.inf, np.float32)
+    bend = np.ones(len(pull), np.float32)
+    strong = model.body_strength > 0.0
+    pull[strong] = (model.body_strength * np.pi * model.body_radius[:, 0] ** 2)[strong]
+    for end in ends.T:
+        pull[end] = model.bunch_pull
+        bend[end] = model.bunch_bend
+    return pull, bend
 
 
 def wood_kinds(model: Model, ends: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ try:
 except ImportError as error:
     raise MissingExtra(f"vinesim.learn needs gymnasium: pip install 'vinesim[learn]' ({error})") from error
 
-TASKS = {"reach": "reached", "expose": "exposed", "pick": "picked"}
+TASKS = {"reach": "reached", "expose": "exposed", "pick": "picked", "prune": "pruned"}
 """Tasks by name, each with the word for its success. Task ``reach`` is ``vinesim.learn.reach.ReachEnv``."""
 
 for _task in TASKS:

@@ -1,4 +1,4 @@
-"""The arm of the learning tasks: seven joints and two fingers, on a base that is bolted down, and a blade for picking.
+"""The arm of the learning tasks: seven joints and two fingers, on a base that is bolted down, and its blades.
 
 Lengths, masses and limits are those of no product. They are GUESSED in the range of arms that carry 3 kg.
 """
@@ -84,3 +84,13 @@ def harvest_blade() -> Blade:
     """
     mouth = frames.pose(np.array([0.17, 0.0, 0.02]))
     return Blade("arm", TOOL_LINK, mouth, np.array([0.04, 0.024, 0.003]), 150.0)
+
+
+def pruning_blade() -> Blade:
+    """Returns the blade of pruning shears, whose bars the fingers are: it closes across their plane, between their
+    tips, within a step.
+
+    Force and mouth are GUESSED: 1,500 N cuts dormant canes of 10 mm, the mouth is as wide as the open fingers.
+    """
+    mouth = frames.pose(np.array([0.18, 0.0, 0.0]))
+    return Blade("arm", TOOL_LINK, mouth, np.array([0.03, 0.024, 0.003]), 1500.0)

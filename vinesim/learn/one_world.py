@@ -9,6 +9,7 @@ import numpy as np
 
 from vinesim.learn.expose import ExposeEnv
 from vinesim.learn.pick import PickEnv
+from vinesim.learn.prune import PruneEnv
 from vinesim.learn.reach import ReachEnv
 from vinesim.learn.task_env import RENDER_MODES, TaskEnv, of_world
 
@@ -62,3 +63,10 @@ class PickOne(OneWorld):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(PickEnv(1, **options))
+
+
+class PruneOne(OneWorld):
+    """:class:`PruneEnv` with one world. ``options``: arguments of :class:`PruneEnv` except ``num_envs``, ``arrays``."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(PruneEnv(1, **options))

@@ -86,6 +86,9 @@ _COUNTS = 9
 """Length of the array of counts. The entry :data:`_NEXT_LEVEL` is the number of the next substep, the entry
 :data:`_LEVELS` the number of substeps of the step."""
 
+ROCKING_TIME = 0.3
+"""[s] Time constant with which cut wood on the ground, a wire or a post stops to turn. GUESSED: contacts have no
+resistance to rolling, and a bent cane that lies on two points would rock for minutes."""
 _log = logging.getLogger(__name__)
 _NO_TREES = np.zeros(0, np.int32)
 _NO_WRENCHES = np.zeros((0, 6), np.float32)
@@ -102,6 +105,8 @@ class Beside(NamedTuple):
     """Launches what runs beside the prediction of the trees."""
     integrate: Callable[[], None]
     """Launches what runs beside their integration."""
+    end: Callable[[], None] = _launch_nothing
+    """Launches what runs after each step, alone."""
 
 
 _NOTHING_BESIDE = Beside(_launch_nothing, _launch_nothing)
@@ -713,6 +718,14 @@ class ArticulationSolver:
         else:
             self._runner.advance(steps, *floating, between, beside)
         self.tick += steps
+
+    def let_kernels_cut(self, cuts: int) -> None:
+        """Let kernels cut trees during :meth:`advance`, by changing the solver's arrays as :meth:`cut` does.
+
+        They write the floating roots to the first ``cuts`` times [tree] entries of the list ``floating``, with -1 for
+        none. The host's state does not learn of these cuts. Every tree counts as a topology of its own.
+        """
+        self._runner.let_kernels_cut(cuts * len(self.model.tree_first))
 
     def upload(self) -> None:
         """Copy the host's arrays of the awake trees to the device; on a CPU there is nothing to copy."""
@@ -1526,6 +1539,8 @@ class KernelLaunches:
         self._record_step(self.parameters)
         self.shared = self._record_step_kernels(self.parameters)
         """The kernels of a step, bound to the arrays that NumPy also uses."""
+        self.of_kernels: tuple[str, ...] = ()
+        """Arrays of trees that only kernels change from now on, see :meth:`ArticulationSolver.let_kernels_cut`."""
         self.resident = self.shared
         """The kernels for a sequence of steps without transfers to the host. On a GPU they are bound to separate
         arrays."""
@@ -1900,13 +1915,14 @@ class KernelLaunches:
         self._arrays = shared
 
     def upload_trees(self) -> None:
-        """Copy the arrays that NumPy uses to the arrays of the :attr:`resident` kernels."""
-        for name in TREE_INPUTS if self.buffers.has_copies else ():
+        """Copy the arrays that NumPy uses, and that kernels do not change, to the arrays of the :attr:`resident`
+        kernels."""
+        for name in [name for name in TREE_INPUTS if name not in self.of_kernels] if self.buffers.has_copies else ():
             wp.copy(self.resident_arrays[name], self.buffers.host_array(name))
 
     def download_trees(self) -> None:
         """Copy the results of the :attr:`resident` kernels to the arrays that NumPy uses."""
-        for name in TREE_RESULTS if self.buffers.has_copies else ():
+        for name in TREE_RESULTS + self.of_kernels if self.buffers.has_copies else ():
             wp.copy(self.buffers.host_array(name), self.resident_arrays[name])
 
     def list_budgets(self, trees: np.ndarray) -> None:
@@ -2242,6 +2258,8 @@ class StepRunner:
         """Length of the longest list of an integration."""
         self._levels: Levels = ()
         self._roots = 0
+        self._places = 0
+        """Number of places for floating roots that kernels write."""
         self._root_levels: Levels = ()
         self._divided = np.zeros(0, np.int32)
         """[k] Number of substeps of each tree of :attr:`fast` when the list was last sorted."""
@@ -2301,6 +2319,17 @@ class StepRunner:
         groups[:, 1] = np.diff(self._starts)
         self._whole_groups = int(np.searchsorted(self._starts, self._whole))
 
+    def let_kernels_cut(self, places: int) -> None:
+        """Let kernels write the first ``places`` entries of the list of floating roots, and change the topology of each
+        tree."""
+        self._places = places
+        launches = self._launches
+        self._lists["floating"][:places] = -1
+        launches.upload_trees()
+        launches.of_kernels = ("floating", "tree_moving", "tree_budget")
+        self._topologies.alone = True
+        self._order()
+
     def _divide(self, touched: np.ndarray) -> None:
         """Divide the next step of all fast trees into substeps, except for trees that are ``touched`` [k]."""
         if len(self.fast) == 0:
@@ -2318,7 +2347,7 @@ class StepRunner:
         """Write the list of floating roots, sorted by the substeps of their trees. ``roots`` [k]: places of the roots
         in the kernels' arrays; ``trees`` [k]: their trees."""
         if len(roots) == 0:
-            self._roots = 0
+            self._roots = self._places
             self._root_levels = ()
             return
         order, self._roots, self._root_levels = _by_substeps(np.arange(len(roots)), self._steps_of[trees])
@@ -2415,6 +2444,7 @@ class StepRunner:
             between()
             self._integrate(step)
             beside.integrate()
+            beside.end()
 
     def _steps_on_two_streams(self, steps: int, between: Callable[[], None], beside: Beside) -> None:
         """Take steps on a GPU with the trees on a second stream, beside what ``beside`` launches.
@@ -2434,6 +2464,7 @@ class StepRunner:
                 self._integrate(step)
             beside.integrate()
             stream.wait_stream(self._second_stream)
+            beside.end()
 
     @functools.cached_property
     def _second_stream(self) -> wp.Stream:
@@ -2469,6 +2500,8 @@ class Topologies:
         self._model = model
         self._body_cut = body_cut
         self._moving = tree_moving
+        self.alone = False
+        """Whether each tree counts as a topology of its own."""
         known: dict[bytes, int] = {}
         parent = np.maximum(model.body_parent - model.tree_first[model.body_tree], -1).astype(np.int32)
 
@@ -2484,6 +2517,8 @@ class Topologies:
         is_fine = self._moving[trees] == self._model.tree_size[trees]
         cut = self._model.body_tree[np.flatnonzero(self._body_cut)]
         alone = -1 - trees.astype(np.int64)
+        if self.alone:
+            return alone
         return np.where(np.isin(trees, cut), alone, np.where(is_fine, self._fine[trees], self._coarse[trees]))
 
 

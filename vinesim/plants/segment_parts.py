@@ -50,17 +50,36 @@ class Part:
     """[m^2] Drag area."""
 
 
-def part_of(model: Model, segment: int, start: float, end: float) -> Part:
-    """Returns the part of a segment's wood from ``start`` to ``end`` [m], with the leaves that grow on it.
+@dataclasses.dataclass(frozen=True)
+class Rod:
+    """What a segment of wood consists of: a uniform rod and points on it."""
 
-    All parts keep the lateral offset of the segment's centre of mass, so that their products of inertia are zero, as
-    those of the segment are. The true offset differs by that of leaves, which is about a centimetre.
-    """
+    length: float
+    """[m]"""
+    mass: float
+    """[kg] Mass of the rod without the points."""
+    points: np.ndarray
+    """[k] kg, masses of the leaves, and of a weight at one end, which is the last one."""
+    places: np.ndarray
+    """[k] m, places of the points along the rod."""
+    rest: float
+    """[kg m^2] Second moment of mass along the rod that rod and points do not explain; it is spread along the rod."""
+    second: np.ndarray
+    """[3] kg m^2, second moments of mass of the segment about its centre, along each axis."""
+    around: np.ndarray
+    """[2] kg m^2, second moments of the rod's mass across it, along y and z."""
+    across: np.ndarray
+    """[k - 1, 2] kg m^2, those of the leaves."""
+
+
+def rod_of(model: Model, segment: int) -> Rod:
+    """Returns what a segment of wood consists of. Raises :class:`ValueError` if its masses are not those of a rod with
+    leaves."""
     length = float(model.body_length[segment])
     mass = float(model.body_mass[segment])
     com = model.body_com[segment].astype(float)
     xx, yy, zz = model.body_inertia[segment].astype(float)
-    second = 0.5 * np.array([yy + zz - xx, zz + xx - yy, xx + yy - zz])  # of mass, about the centre, along each axis
+    second = 0.5 * np.array([yy + zz - xx, zz + xx - yy, xx + yy - zz])
     leaves = np.flatnonzero(model.leaf_body == segment)
     leaf_mass = model.leaf_mass[leaves].astype(float)
     leaf_at = model.leaf_pose[leaves, :3].astype(float)
@@ -72,28 +91,38 @@ def part_of(model: Model, segment: int, start: float, end: float) -> Part:
     rod = wood - abs(end_mass)
     if not (wood > 0.0 and rod > 0.0):
         raise ValueError(f"body {segment}: its mass {mass:.3g} kg with leaves of {leaf_mass.sum():.3g} kg is no rod")
-    tip = length if end_mass > 0.0 else 0.0
-    # what the rod and the points do not explain is spread along the rod
     points = np.append(leaf_mass, abs(end_mass))
-    places = np.append(leaf_at[:, 0], tip)
+    places = np.append(leaf_at[:, 0], length if end_mass > 0.0 else 0.0)
     known = rod * (length * length / 12.0 + (0.5 * length - com[0]) ** 2) + points @ (places - com[0]) ** 2
-    rest = second[0] - known
     across = leaf_mass[:, None] * (leaf_at[:, 1:] - com[1:]) ** 2
-    around = np.maximum(second[1:] - across.sum(0), 0.0)  # of the rod
-    whole = around + across.sum(0)
+    around = np.maximum(second[1:] - across.sum(0), 0.0)
+    return Rod(length, rod, points, places, second[0] - known, second, around, across)
 
-    share = (end - start) / length
+
+def part_of(model: Model, segment: int, start: float, end: float) -> Part:
+    """Returns the part of a segment's wood from ``start`` to ``end`` [m], with the leaves that grow on it.
+
+    All parts keep the lateral offset of the segment's centre of mass, so that their products of inertia are zero, as
+    those of the segment are. The true offset differs by that of leaves, which is about a centimetre.
+    """
+    rod = rod_of(model, segment)
+    com = model.body_com[segment].astype(float)
+    leaves = np.flatnonzero(model.leaf_body == segment)
+    whole = rod.around + rod.across.sum(0)
+    tip = rod.places[-1]
+    share = (end - start) / rod.length
     grows = grows_between(model, segment, leaves, start, end)
-    here = np.append(grows, start <= tip < end or (end >= length and tip == length))
-    own = points[here]
-    x = places[here]
-    total = share * rod + own.sum()
-    center = (share * rod * 0.5 * (start + end) + own @ x) / total
-    along = share * rod * ((end - start) ** 2 / 12.0 + (0.5 * (start + end) - center) ** 2) + own @ (x - center) ** 2
-    along += share * rest
+    here = np.append(grows, start <= tip < end or (end >= rod.length and tip == rod.length))
+    own = rod.points[here]
+    x = rod.places[here]
+    total = share * rod.mass + own.sum()
+    center = (share * rod.mass * 0.5 * (start + end) + own @ x) / total
+    along = share * rod.mass * ((end - start) ** 2 / 12.0 + (0.5 * (start + end) - center) ** 2)
+    along += own @ (x - center) ** 2 + share * rod.rest
     if not along > 0.0:
         raise ValueError(f"body {segment}: inertia {model.body_inertia[segment]} kg m^2 is not that of a rod")
-    beside = (share * around + across[here[:-1]].sum(0)) * np.where(whole > 0.0, second[1:] / whole, 0.0)
+    spread = share * rod.around + rod.across[here[:-1]].sum(0)
+    beside = spread * np.where(whole > 0.0, rod.second[1:] / np.where(whole > 0.0, whole, 1.0), 0.0)
     drag = model.leaf_drag[leaves].astype(float)
     bare = max(float(model.body_drag[segment]) - drag.sum(), 0.0)
     return Part(
@@ -130,7 +159,7 @@ def without_leaves(model: Model, part: Part, leaves: np.ndarray) -> Part:
     return Part(left, com, inertia, max(part.drag - float(model.leaf_drag[leaves].sum()), 0.0))
 
 
-_CLAMPED = 2.0 * 3.0 / 1.875104**4
+CLAMPED = 2.0 * 3.0 / 1.875104**4
 """Compliance of the spring at a clamp with which a rigid rod has the first frequency of an elastic one, relative to
 that of half the rod. w^2 = 3 k / (m L^2) of the rigid rod equals 1.875104^4 E I / (m L^3) of the Euler-Bernoulli beam.
 """
@@ -145,16 +174,22 @@ def joint_compliance(model: Model, segment: int, own: float, above: float) -> fl
     Both are taken as the same wood; where they are not, the thicker parent's share is small. The spring of a stump at a
     clamp bends for the whole stump, which has no other joint.
     """
-    parent = int(model.body_parent[segment])
-    if parent < 0 or model.body_organ[parent] == int(Organ.BUNCH):
-        return _CLAMPED * own if own < 1.0 else 1.0
-    length = model.body_length[[segment, parent]].astype(float)
-    radius = np.array([model.body_radius[segment, 0], model.body_radius[parent, 1]], float)
-    if not (radius > 0.0).all():
-        return own
-    half = length / radius**4
-    share = float(half[0] / half.sum())
+    share = float(own_share(model, np.array([segment]))[0])
+    if share < 0.0:
+        return CLAMPED * own if own < 1.0 else 1.0
     return share * own + (1.0 - share) * above
+
+
+def own_share(model: Model, segments: np.ndarray) -> np.ndarray:
+    """Returns the shares [k] of ``segments`` [k] in the compliances of their joints; the rest is their parents'. -1 for
+    a joint at a clamp, 1 without radii."""
+    parent = model.body_parent[segments]
+    pair = np.stack([segments, np.maximum(parent, 0)])
+    radius = np.stack([model.body_radius[segments, 0], model.body_radius[pair[1], 1]]).astype(float)
+    is_round = (radius > 0.0).all(0)
+    half = model.body_length[pair].astype(float) / np.where(radius > 0.0, radius, 1.0) ** 4
+    clamped = (parent < 0) | (model.body_organ[pair[1]] == int(Organ.BUNCH))
+    return np.where(clamped, -1.0, np.where(is_round, half[0] / half.sum(0), 1.0))
 
 
 def relaxed_joint(model: Model, segment: int, compliance: float) -> tuple[np.ndarray, np.ndarray]:

@@ -49,7 +49,7 @@ class BatchContacts:
 
     ``plants.advance(steps, contacts.solve)`` takes steps with these contacts. Each tree touches ground, poles, wires
     and fixed wood as it would in :class:`vinesim.world.Physics`, and the rigid bodies of its world, but no other tree.
-    All trees must be awake, without cut-off parts, and with first modes slow enough for whole steps.
+    All trees must be awake, without cut-off parts at the start, and with first modes slow enough for whole steps.
 
     Args:
         plants: trees, on any device. Tree t of world w has the number ``t * worlds + w``.
@@ -632,6 +632,11 @@ class BatchContacts:
         """Collision capsules of the plants, for kernels. Capsule i of a tree is at ``i * trees + tree``; an entry with
         the body -1 is no capsule."""
         return self._capsules
+
+    @property
+    def is_cut(self) -> wp.array:
+        """[body] bool, whether a body has been cut off since the start, for kernels."""
+        return self._bodies.is_cut
 
     @property
     def count(self) -> np.ndarray:

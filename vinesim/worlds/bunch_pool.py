@@ -1,4 +1,4 @@
-"""Bunches that leave their vines in a batch of worlds, and the blades that cut them off.
+"""Bunches that leave their vines in a batch of worlds, and the blades that cut them off, and canes.
 
 Each world has a pool of rigid bodies. When a bunch is cut off, one of them gets its pose, velocity, mass and shapes, as
 :class:`vinesim.interaction.detachment.DetachmentMonitor` does it in a client. Everything happens on the device.
@@ -16,7 +16,7 @@ from vinesim.core import frames
 from vinesim.core.warp_arrays import struct_fields
 from vinesim.interaction.blades import GAP_STEP, Blade
 from vinesim.interaction.cutting_force import BLADE_FACTORS, energy_exponent
-from vinesim.interaction.detachment import STUB_MASS
+from vinesim.interaction.detachment import SAME_CUT, STUB_MASS
 from vinesim.interaction.stalk import GHOST_SHARE
 from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.plants import structs
@@ -32,26 +32,31 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spare_bodies import PLACE_STEP
 from vinesim.worlds.batch_contacts import BatchContacts
+from vinesim.worlds.cane_cuts import CaneCuts
+from vinesim.worlds.overload import Overload
 from vinesim.worlds.rigid_batch import RigidBatch
 
 OWN = tuple(struct_fields(kernels.WarpModel))
 """Arrays of mujoco_warp's model of which each world of a batch with a pool has rows of its own."""
 PARKING_HEIGHT = 100.0
 """[m] Height at which unused bodies are held, away from everything that they could touch."""
+CAPSULE_ARRAYS = ("body", "local_start", "local_end", "rest_start", "rest_end", "radius", "material", "extent")
+"""Arrays of capsules that cuts change."""
 SPARE = 1e-3
 """[m] Size of shapes that a bunch has not, inside its first sphere."""
 
 
 class BunchPool:
-    """The free bunches of all worlds, and the blade with which each world's robot cuts them off.
+    """The free bunches of all worlds, and the blade with which each world's robot cuts them off, and cuts canes.
 
     Args:
         plants: trees of all worlds.
         bodies: rigid bodies of all worlds; :func:`add_pool` has added the pool.
         contacts: contacts of the plants.
-        blade: the blade, a ``bypass`` or ``anvil`` blade that closes within a step.
+        blade: the blade, a ``bypass`` or ``anvil`` blade that closes within a step. None: nothing is cut.
         faults: [world] faults, see :attr:`vinesim.worlds.worlds.Worlds.faults`.
         fault_count: [world] number of times that a world without faults got one.
+        breaks: whether wood breaks under its load.
 
     Raises :class:`ValueError` for another blade.
     """
@@ -61,13 +66,14 @@ class BunchPool:
         plants: ArticulationSolver,
         bodies: RigidBatch,
         contacts: BatchContacts,
-        blade: Blade,
+        blade: Blade | None,
         faults: wp.array,
         fault_count: wp.array,
+        *,
+        breaks: bool = False,
     ) -> None:
-        if np.isfinite(blade.speed) or blade.kind == "saw":
-            raise ValueError(f"a {blade.kind} blade with {blade.speed:g} m/s: a batch has blades that close at once")
-        bodies.rigid.link_pose(blade.actor, blade.link)  # raises an error if there is no such link
+        if blade is not None:
+            _check(blade, bodies)
         self._plants = plants
         self._bodies = bodies
         self._contacts = contacts
@@ -77,8 +83,8 @@ class BunchPool:
         self.closing = self._zeros(wp.bool, bodies.count)
         """[world] Whether the blade closes at the end of the next call of ``Worlds.step``, which clears it."""
         self.needed = self._zeros(float, bodies.count)
-        """[world] N: force that the last closing takes, 0 for an empty mouth. Infinite if there was a cane between the
-        blades, or wood thicker than the mouth: then nothing was cut."""
+        """[world] N: force that the last closing takes, 0 for an empty mouth. Infinite if a cane that cannot be cut, or
+        wood thicker than the mouth, was between the blades: then nothing was cut."""
         self.is_free = self._zeros(wp.int32, bunches)
         """[bunch] 1 if the bunch has left its vine, else 0."""
         self.bunch = contacts.free.bunch
@@ -93,15 +99,29 @@ class BunchPool:
         """Where the bodies of the pool are in mujoco_warp's arrays, for kernels."""
         self.hold = KernelGraph(hold, device=str(self._device))
         """Launches the kernel that holds unused bodies at their places. Call it before each step's first half."""
+        stumps = 0 if blade is None else int(model.tree_spares.min())
+        self.canes = CaneCuts(plants, bodies.count, contacts, stumps, breaks=breaks)
+        """The parts of canes that have been cut."""
         cuts = self._cuts(bunches)
-        self.update = KernelGraph(
-            self._move_plants(),
-            self._close(blade, cuts),
-            self._detach(cuts, faults, fault_count),
-            device=str(self._device),
-        )
+        move = self._move_plants()
+        detach = self._detach(cuts, faults, fault_count)
+        closing = []
+        if blade is not None:
+            closing = [self._close(blade, cuts), detach, *self.canes.cut(cuts, self._masses, faults, fault_count)]
+        self.update = KernelGraph(move, *closing, device=str(self._device))
         """Launches the kernels that close blades and detach bunches, and that compute the poses of all plants, at the
         end of a step. mujoco_warp's poses must be those of the end of the step."""
+        self.overload = None
+        """Wood that gives under its load; None if none does."""
+        breaking = []
+        if breaks:
+            self.overload = Overload(plants, bodies.count, contacts.parameters, self._wood, self.canes.topology)
+            part = self.canes.part(self.overload.breaks, faults, fault_count)
+            breaking = [*self.overload.find(cuts, self.is_free), move, detach, *part]
+        ending = [*self.canes.slow_lying_parts(), *breaking]
+        self.end_step = KernelGraph(*ending, device=str(self._device)) if ending else None
+        """Launches the kernels that slow what lies, and part what breaks, after the integration of each step; None if
+        there are none."""
 
     def _zeros(self, dtype: Any, *shape: int) -> wp.array:
         return wp.zeros(shape, dtype=dtype, device=self._device)
@@ -151,6 +171,10 @@ class BunchPool:
 
     def _cuts(self, bunches: int) -> cutting.Cuts:
         cuts = cutting.Cuts()
+        trees = len(self._plants.model.tree_first)
+        cuts.cane = wp.full(trees, -1, dtype=wp.int32, device=self._device)
+        for name in ("cane_at", "cane_force", "cane_diameter"):
+            setattr(cuts, name, self._zeros(wp.float64, trees))
         cuts.segment = wp.full(bunches, -1, dtype=wp.int32, device=self._device)
         for name in ("at", "force", "diameter"):
             setattr(cuts, name, self._zeros(wp.float64, bunches))
@@ -173,6 +197,9 @@ class BunchPool:
         numbers.force = blade.limit
         numbers.factor = BLADE_FACTORS[blade.kind]
         numbers.strength = parameters.peduncle_cutting_strength
+        numbers.cane_strength = parameters.cutting_strength
+        numbers.same_cut = SAME_CUT
+        numbers.least = 2.0 * SHORTEST + PLACE_STEP
         numbers.power = energy_exponent(parameters.cutting_energy_share)
         numbers.gap_step = GAP_STEP
         arrays = self._plants.launches.resident_arrays
@@ -180,7 +207,7 @@ class BunchPool:
         trees = len(self._plants.model.tree_first)
         shape = [numbers, self._bodies.count, trees, self._plants.buffers.pitch]
         tables = [arrays[name] for name in ("tree_first", "tree_size", "body_parent")]
-        given = [*shape, *tables, self._wood, self.is_free, arrays["body_q"], data.xpos, data.xquat]
+        given = [*shape, *tables, self._wood, self.is_free, *self.canes.parts, arrays["body_q"], data.xpos, data.xquat]
         written = [self.closing, self.needed, cuts]
         return KernelLaunch(cutting.close_blades, given, written, threads=self._bodies.count)
 
@@ -237,14 +264,22 @@ class BunchPool:
         of_capsule = self._array(np.arange(len(capsules.body)) % trees, wp.int32)
         of_geom = self._array(np.arange(len(geoms.id)) % self._bodies.count, wp.int32)
         rows = [(getattr(self._masses, name), of_body) for name in struct_fields(kernels.PlantMasses)]
-        rows += [(getattr(capsules, name), of_capsule) for name in ("body", "local_end", "extent")]
+        rows += [(getattr(capsules, name), of_capsule) for name in CAPSULE_ARRAYS]
         moving = int(geoms.count.numpy()[0])
         rows += [(getattr(geoms, name)[:moving], of_geom[:moving]) for name in ("size", "half", "radius")]
         return [
             *rows,
+            *self.canes.of_trees(),
+            *([] if self.overload is None else self.overload.of_trees()),
             (contacts.free.passing, self._array(np.arange(trees), wp.int32)),
             (self.is_free, self._array(model.body_tree[model.bunch_body], wp.int32)),
         ]
+
+
+def _check(blade: Blade, bodies: RigidBatch) -> None:
+    if np.isfinite(blade.speed) or blade.kind == "saw":
+        raise ValueError(f"a {blade.kind} blade with {blade.speed:g} m/s: a batch has blades that close at once")
+    bodies.rigid.link_pose(blade.actor, blade.link)  # raises an error if there is no such link
 
 
 def parking_pose(slot: int) -> np.ndarray:
@@ -253,10 +288,10 @@ def parking_pose(slot: int) -> np.ndarray:
 
 
 def shapes_of_bunches(model: Model) -> tuple[int, int]:
-    """Returns the largest numbers of spheres of a bunch, and of segments of a peduncle."""
+    """Returns the largest numbers of spheres of a bunch, at least 1, and of segments of a peduncle."""
     capsules = plant_capsules(model)
     of_body = np.bincount(capsules.body[capsules.level < 2], minlength=len(model.body_mass))
-    spheres = int(of_body[model.bunch_body].max(initial=0))
+    spheres = int(of_body[model.bunch_body].max(initial=1))
     pieces = 0
     body = model.body_parent[model.bunch_body]
     while (is_stalk := (body >= 0) & (model.body_organ[body] == int(Organ.PEDUNCLE))).any():

@@ -4,7 +4,7 @@ A step has the stages of :class:`vinesim.world.Physics`: both sides predict thei
 are found and solved together, both sides integrate. Nothing is copied between host and GPU during a step.
 
 What a client's world has and a batch does not: contacts between plants, wires and arms that deform, hands of people,
-wood that breaks or is cut (except peduncles that a blade cuts), sleep, and bunches with moving berry clusters.
+sleep, and bunches with moving berry clusters.
 """
 
 from __future__ import annotations
@@ -61,8 +61,10 @@ class Worlds:
         device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
         slots: number of contacts that the plants of one world can have at once. Further contacts are left out, and
             counted in :attr:`dropped`.
-        blade: the blade of one of the robots, which can cut peduncles. None: nothing is cut.
+        blade: the blade of one of the robots. It cuts peduncles, and canes of trees with spare bodies for the stumps
+            (:func:`vinesim.scene.spare_bodies.with_spares`), see :mod:`vinesim.worlds.cane_cuts`. None: nothing is cut.
         bunches: number of bunches that can come off in each world.
+        breaks: whether peduncles and canes break under their load, and canes keep a set, as in a client.
 
     Raises :class:`ValueError` if the number of trees does not fit or a tree needs substeps, or for a blade that a batch
     cannot have (see :class:`~vinesim.worlds.bunch_pool.BunchPool`),
@@ -80,6 +82,7 @@ class Worlds:
         slots: int = DEFAULT_SLOTS,
         blade: Blade | None = None,
         bunches: int = 1,
+        breaks: bool = False,
     ) -> None:
         parameters = msgspec.structs.replace(parameters, sleep=False, bunch_pool_size=0)
         self.model = model
@@ -88,9 +91,10 @@ class Worlds:
         rigid = RigidWorld(model, parameters=parameters)
         for robot in robots:
             rigid.add_robot(robot)
-        if blade is not None:
+        has_pool = blade is not None or breaks
+        if has_pool:
             add_pool(rigid, bunches)
-        self.bodies = RigidBatch(rigid, count, device, own=() if blade is None else OWN)
+        self.bodies = RigidBatch(rigid, count, device, own=OWN if has_pool else ())
         """Robots and boxes."""
         self.plants = ArticulationSolver(model, State.at_rest(model), parameters, device=device)
         """Trees."""
@@ -103,16 +107,17 @@ class Worlds:
         self.faults = wp.zeros(count, dtype=wp.int32, device=device)
         """[world] What has gone wrong since the world's last reset: a sum of
         :data:`~vinesim.kernels.worlds.reset.MOTION` (a number is not finite, or a rate too high),
-        :data:`~vinesim.kernels.worlds.reset.ROOM` (contacts were left out) and
-        :data:`~vinesim.kernels.worlds.reset.BUNCHES` (a bunch was cut off for which the pool has no body). 0: nothing.
+        :data:`~vinesim.kernels.worlds.reset.ROOM` (contacts were left out),
+        :data:`~vinesim.kernels.worlds.reset.BUNCHES` (a bunch was cut off for which the pool has no body) and
+        :data:`~vinesim.kernels.worlds.reset.STUMPS` (a cane was cut whose tree has no spare body left). 0: nothing.
         A world with a fault goes on as it can, until it is reset."""
         self.fault_count = wp.zeros(count, dtype=wp.int32, device=device)
         """[world] Number of times since the start that a world without faults got one."""
         self.pool: BunchPool | None = None
-        """Bunches that come off; None without a blade."""
-        if blade is not None:
+        """Bunches that come off; None if nothing is cut or breaks."""
+        if has_pool:
             state = (self.faults, self.fault_count)
-            self.pool = BunchPool(self.plants, self.bodies, self.contacts, blade, *state)
+            self.pool = BunchPool(self.plants, self.bodies, self.contacts, blade, *state, breaks=breaks)
         self._check = self._check_graph(device)
         self._reset = self._reset_graph(device)
 
@@ -128,6 +133,7 @@ class Worlds:
         of_worlds = []
         if self.pool is not None:
             state += self.pool.of_trees()
+            launches += self.pool.canes.restore_flags(self._resets)
             of_worlds += [_as_table(array) for array in self.pool.of_worlds()]
         for array, tree in state:
             rows = _as_table(array)
@@ -183,7 +189,10 @@ class Worlds:
 
     def step(self, steps: int = 1) -> None:
         """Advance all worlds by ``steps`` steps."""
-        self.plants.advance(steps, self.contacts.solve, Beside(self._predict_bodies, self.bodies.integrate))
+        beside = Beside(self._predict_bodies, self.bodies.integrate)
+        if self.pool is not None and self.pool.end_step is not None:
+            beside = beside._replace(end=self.pool.end_step)
+        self.plants.advance(steps, self.contacts.solve, beside)
         self._check()
         if self.pool is not None:
             self.bodies.update_kinematics()

@@ -11,7 +11,7 @@ from vinesim.cli.commands.options import Device
 
 
 def train(
-    task: Annotated[str, typer.Argument(help="reach, expose or pick.")],
+    task: Annotated[str, typer.Argument(help="reach, expose, pick or prune.")],
     out: Annotated[
         pathlib.Path | None, typer.Option(help="Folder for policy.npz, curve.csv and summary.json of a training.")
     ] = None,

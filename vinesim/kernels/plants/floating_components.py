@@ -183,7 +183,7 @@ def correct_floating_momentum(
     """One thread per floating component. Correct its momentum and the path of its centre of mass to agree with the
     external forces.
 
-    roots: [thread] the cut body of a component that no tie holds. Nothing happens in a tree with tree_rate [tree] above
+    roots: [thread] the cut body of a component that no tie holds; -1: none. Nothing happens in a tree with tree_rate [tree] above
     ``p.fault_rate``. tree_steps: [tree] number of substeps of the step; this launch corrects one substep. bodies: at
     the start of the step. body_acceleration: [body] m/s^2, rad/s^2 over the step. lever: [body] m. joints_out: joints
     at the end of the step; rotation, rates and position of the root are corrected.
@@ -191,6 +191,8 @@ def correct_floating_momentum(
     if wp.tid() >= count[0]:
         return
     root = roots[wp.tid()]
+    if root < 0:
+        return
     tree = model.body_tree[root]
     step = substep_parameters(p, tree_steps[tree])
     dt = step.dt

@@ -177,7 +177,7 @@ def apply_loaded_wrenches(
     scratch_out: Scratch,
     prediction_out: Prediction,
 ):
-    """Add the effect of wrenches over a step to the prediction of one tree with a fixed root.
+    """Add the effect of wrenches over a step to the prediction of one tree.
 
     The wrenches act on the tree's ``count`` loaded bodies, which are in ascending order. The result is that of
     :func:`vinesim.kernels.plants.impulse_response.apply_tree_wrenches`, with less memory traffic: sums stay in
@@ -214,8 +214,10 @@ def apply_loaded_wrenches(
         moment = wp.spatial_bottom(wrench)
         scratch_out.Du[k] = D * moment
         carried = wp.spatial_vector()
-        if parent >= 0:
-            force = wp.spatial_top(wrench) - wp.transpose(DH) * moment
+        force = wp.spatial_top(wrench) - wp.transpose(DH) * moment
+        if parent < 0:
+            work_out.subtree_wrench[k] = wp.spatial_vector(force, wp.vec3())
+        else:
             moment = moment - wp.transpose(DJ) * moment + wp.cross(lever, force)
             carried = wp.spatial_vector(force, moment)
             if parent != k - model.pitch:
@@ -236,6 +238,9 @@ def apply_loaded_wrenches(
         if parent < 0:
             a = wp.vec3()
             alpha = wp.vec3()
+            if k <= last and model.body_root[k] >= 0:
+                a = factors.root_inverse_mass[k] * wp.spatial_top(work_out.subtree_wrench[k])
+                prediction_out.joint_xd_free[k] = prediction_out.joint_xd_free[k] + dt * a
         elif parent != k - model.pitch:
             a = wp.spatial_top(work_out.added_acceleration[parent])
             alpha = wp.spatial_bottom(work_out.added_acceleration[parent])

@@ -1,7 +1,7 @@
 """Blades of a batch of worlds: what is in the mouth of a closing blade, and whether the blade's force suffices.
 
 The law is that of :mod:`vinesim.interaction.blades` for a blade that closes within a step: it cuts all peduncles in its
-mouth if its force is that of the cut, and nothing otherwise.
+mouth, and one cane of each tree, if its force is that of the cut, and nothing otherwise.
 """
 
 import warp as wp
@@ -14,6 +14,8 @@ CANE = wp.constant(1)
 PEDUNCLE = wp.constant(2)
 """Kinds of bodies that blades cut, see :class:`Wood`."""
 NONE = wp.constant(-1)
+WHOLE = wp.constant(-2)
+"""A cut at the joint of the bunch itself, which leaves all of its stalk on the vine."""
 
 
 @wp.struct
@@ -32,10 +34,16 @@ class BladeNumbers:
     """[1] Force of this kind of blade relative to a bypass blade."""
     strength: wp.float64
     """[Pa] Largest cutting force of a peduncle per cross-section."""
+    cane_strength: wp.float64
+    """[Pa] The same of a cane."""
     power: wp.float64
     """[1] Exponent of :func:`force_share`."""
     gap_step: wp.float64
     """[m] Distance between two gaps at which the force of a closing is evaluated."""
+    same_cut: wp.float64
+    """[m] Wood of a cane that is shorter than this before or beyond a cut is not cut again."""
+    least: wp.float64
+    """[m] Length of the shortest wood of a cane that can be cut."""
 
 
 @wp.struct
@@ -57,11 +65,38 @@ class Wood:
 
 
 @wp.struct
+class Canes:
+    """The parts of canes [body], which cuts change. A segment that was cut has a body for each part; all have its
+    frame."""
+
+    can_cut: wp.array(dtype=wp.int32)
+    """1 for segments that can be cut: bare wood of a tree with spare bodies and without ties."""
+    length: wp.array(dtype=float)
+    """m, length of the segment."""
+    segment: wp.array(dtype=wp.int32)
+    """Segment of which a body is a part: itself, or that of a stump; -1: a spare body."""
+    start: wp.array(dtype=float)
+    """m, from the origin to the beginning of the body's wood."""
+    end: wp.array(dtype=float)
+    """m, from the origin to the end of its wood."""
+
+
+@wp.struct
 class Cuts:
     """What blades cut in this step."""
 
+    cane: wp.array(dtype=wp.int32)
+    """[tree] Body of the cane that is cut; -1: none."""
+    cane_at: wp.array(dtype=wp.float64)
+    """[tree] m, place of the cut from the body's origin."""
+    cane_force: wp.array(dtype=wp.float64)
+    """[tree] N, largest force of a cut there."""
+    cane_diameter: wp.array(dtype=wp.float64)
+    """[tree] m."""
+
     segment: wp.array(dtype=wp.int32)
-    """[bunch] Body of the segment of its peduncle that is cut; -1: the bunch hangs on, or has left."""
+    """[bunch] Body of the segment of its peduncle that is cut; -1: the bunch hangs on, or has left; -2: see
+    :data:`WHOLE`."""
     at: wp.array(dtype=wp.float64)
     """[bunch] m, place of the cut along the segment."""
     force: wp.array(dtype=wp.float64)
@@ -79,12 +114,15 @@ def force_share(depth: wp.float64, power: wp.float64):
 
 
 @wp.func
-def axis_in_mouth(mouth: wp.transformd, half: wp.vec3d, pose: wp.transform, length: wp.float64):
+def axis_in_mouth(mouth: wp.transformd, half: wp.vec3d, pose: wp.transform, start: float, end: float):
     """Returns the heights [m] of the start of a body's axis above the plane in which the blades close and of its end
     above its start, and the shares of the axis between which it is in the mouth; it is not in it if the first share is
-    larger than the second. ``mouth``: pose of the mouth in the world."""
-    first = wp.transform_point(wp.transform_inverse(mouth), to_double(wp.transform_get_translation(pose)))
-    tip = to_double(wp.transform_point(pose, wp.vec3(wp.float32(length), 0.0, 0.0)))
+    larger than the second. ``mouth``: pose of the mouth in the world. ``start``, ``end`` [m]: places of both ends of
+    the axis along the body."""
+    first = wp.transform_point(
+        wp.transform_inverse(mouth), to_double(wp.transform_point(pose, wp.vec3(start, 0.0, 0.0)))
+    )
+    tip = to_double(wp.transform_point(pose, wp.vec3(end, 0.0, 0.0)))
     along = wp.transform_point(wp.transform_inverse(mouth), tip) - first
     enter = wp.float64(0.0)
     leave = wp.float64(1.0)
@@ -105,25 +143,64 @@ def nearest_share(height: wp.float64, rise: wp.float64, enter: wp.float64, leave
 
 
 @wp.func
-def has_cane(
+def cut_at(segment: int, place: wp.float64, strength: wp.float64, wood: Wood):
+    """Returns the diameter [m] of a segment at a ``place`` [m] along it, and the largest force [N] of a cut there."""
+    radius = wood.radius[segment]
+    start = wp.float64(radius[0])
+    length = wp.max(wp.float64(wood.length[segment]), wp.float64(1.0e-9))
+    diameter = wp.float64(2.0) * (start + (wp.float64(radius[1]) - start) * place / length)
+    return diameter, strength * wp.float64(0.25) * wp.float64(wp.pi) * diameter * diameter
+
+
+@wp.func
+def find_cane(
     tree: int,
+    blade: BladeNumbers,
     mouth: wp.transformd,
-    half: wp.vec3d,
     first: int,
     size: int,
     pitch: int,
     wood: Wood,
+    canes: Canes,
+    is_cut: wp.array(dtype=wp.bool),
     body_q: wp.array(dtype=wp.transform),
+    cuts_out: Cuts,
 ):
-    """Returns whether a cane of a tree crosses the plane in which the blades close, in the mouth."""
-    found = bool(False)
+    """Write where a blade would cut a cane of a tree: of those whose axis crosses the plane in which the blades close, in
+    the mouth, the first. Returns whether it is one that cannot be cut."""
+    found = int(NONE)
     for k in range(first, first + size * pitch, pitch):
-        if wood.kind[k] == CANE:
-            height, rise, enter, leave = axis_in_mouth(mouth, half, body_q[k], wp.float64(wood.length[k]))
-            apart = wp.abs(height + nearest_share(height, rise, enter, leave) * rise)
-            thickness = wp.float64(0.5 * (wood.radius[k][0] + wood.radius[k][1]))
-            found = found or (enter <= leave and apart <= thickness)
-    return found
+        segment = canes.segment[k]
+        if found < 0 and segment >= 0 and wood.kind[wp.max(segment, 0)] == CANE:
+            start = canes.start[k]
+            end = canes.end[k]
+            height, rise, enter, leave = axis_in_mouth(mouth, blade.half, body_q[k], start, end)
+            share = nearest_share(height, rise, enter, leave)
+            apart = wp.abs(height + share * rise)
+            thickness = wp.float64(0.5 * (wood.radius[segment][0] + wood.radius[segment][1]))
+            before = share * wp.float64(end - start)
+            beyond = wp.float64(end - start) - before
+            is_new = before >= blade.same_cut or not (start > 0.0 or is_cut[k])
+            is_new = is_new and (beyond >= blade.same_cut or end >= canes.length[segment])
+            is_new = is_new and wp.float64(end - start) >= blade.least
+            if enter <= leave and apart <= thickness and is_new:
+                found = k
+                place = wp.float64(start) + before
+                diameter, force = cut_at(segment, place, blade.cane_strength, wood)
+                cuts_out.cane_at[tree] = place
+                cuts_out.cane_diameter[tree] = diameter
+                cuts_out.cane_force[tree] = force
+    cuts_out.cane[tree] = found
+    return found >= 0 and canes.can_cut[canes.segment[wp.max(found, 0)]] == 0
+
+
+@wp.func
+def hangs_from(k: int, cane: int, body_parent: wp.array(dtype=wp.int32)):
+    """Returns whether body ``k`` is beyond the body ``cane`` of its tree."""
+    at = int(k)
+    while at > cane:
+        at = body_parent[at]
+    return at == cane and k != cane
 
 
 @wp.func
@@ -143,7 +220,7 @@ def find_cut(
     place = wp.float64(0.0)
     k = body_parent[wood.bunch_body[bunch]]
     while k >= 0 and wood.kind[wp.max(k, 0)] == PEDUNCLE:
-        height, rise, enter, leave = axis_in_mouth(mouth, blade.half, body_q[k], wp.float64(wood.length[k]))
+        height, rise, enter, leave = axis_in_mouth(mouth, blade.half, body_q[k], 0.0, wood.length[k])
         share = nearest_share(height, rise, enter, leave)
         apart = wp.abs(height + share * rise)
         if enter <= leave and apart < nearest:
@@ -153,13 +230,16 @@ def find_cut(
         k = body_parent[k]
     cuts_out.segment[bunch] = segment
     if segment >= 0:
-        radius = wood.radius[segment]
-        start = wp.float64(radius[0])
-        length = wp.max(wp.float64(wood.length[segment]), wp.float64(1.0e-9))
-        diameter = wp.float64(2.0) * (start + (wp.float64(radius[1]) - start) * place / length)
+        diameter, force = cut_at(segment, place, blade.strength, wood)
         cuts_out.at[bunch] = place
         cuts_out.diameter[bunch] = diameter
-        cuts_out.force[bunch] = blade.strength * wp.float64(0.25) * wp.float64(wp.pi) * diameter * diameter
+        cuts_out.force[bunch] = force
+
+
+@wp.func
+def force_at(depth: wp.float64, most: wp.float64, power: wp.float64):
+    """Returns the force [N] of a cut at a ``depth``, whose largest force is ``most`` [N]; 0 before the edges touch."""
+    return wp.where(depth > wp.float64(0.0), most * force_share(depth, power), wp.float64(0.0))
 
 
 @wp.kernel
@@ -175,6 +255,8 @@ def close_blades(
     wood: Wood,
     # in
     is_free: wp.array(dtype=wp.int32),
+    canes: Canes,
+    is_cut: wp.array(dtype=wp.bool),
     body_q: wp.array(dtype=wp.transform),
     xpos: wp.array2d(dtype=wp.vec3),
     xquat: wp.array2d(dtype=wp.quat),
@@ -183,11 +265,11 @@ def close_blades(
     needed_out: wp.array(dtype=float),
     cuts_out: Cuts,
 ):
-    """One thread per world. Close its blade if it shall: list the bunches that the blade cuts off.
+    """One thread per world. Close its blade if it shall: list the bunches and the canes that the blade cuts off.
 
-    is_free: [bunch] 1 if the bunch has left its vine. xpos, xquat: mujoco_warp's poses of bodies (wxyz). closing:
+    is_free: [bunch] 1 if the bunch has left its vine. is_cut: [body] whether a body was cut off. xpos, xquat: mujoco_warp's poses of bodies (wxyz). closing:
     [world] whether the blade closes; cleared here. needed: [world] N, force that the last closing takes; infinite if a
-    cane, or wood thicker than the mouth, is between the blades, of which nothing is cut.
+    cane that cannot be cut, or wood thicker than the mouth, is between the blades: then nothing is cut.
     """
     world = wp.tid()
     closes = closing_out[world]
@@ -201,13 +283,20 @@ def close_blades(
     opening = wp.float64(2.0) * blade.half[1]
     needed = wp.float64(0.0)
     for tree in range(world, trees, worlds):
-        if closes and has_cane(tree, mouth, blade.half, tree_first[tree], tree_size[tree], pitch, wood, body_q):
-            needed = wp.float64(wp.inf)
+        cuts_out.cane[tree] = NONE
+        if closes:
+            first = tree_first[tree]
+            size = tree_size[tree]
+            stops = find_cane(tree, blade, mouth, first, size, pitch, wood, canes, is_cut, body_q, cuts_out)
+            if stops or (cuts_out.cane[tree] >= 0 and cuts_out.cane_diameter[tree] > opening):
+                needed = wp.float64(wp.inf)
         for k in range(wood.tree_start[tree], wood.tree_start[tree + 1]):
             bunch = wood.of_tree[k]
             cuts_out.segment[bunch] = NONE
             if closes and is_free[bunch] == 0:
                 find_cut(bunch, blade, mouth, wood, body_parent, body_q, cuts_out)
+                if cuts_out.cane[tree] >= 0 and hangs_from(cuts_out.segment[bunch], cuts_out.cane[tree], body_parent):
+                    cuts_out.segment[bunch] = NONE
                 if cuts_out.segment[bunch] >= 0 and cuts_out.diameter[bunch] > opening:
                     needed = wp.float64(wp.inf)
     if not closes:
@@ -217,16 +306,19 @@ def close_blades(
         gap = opening * (wp.float64(1.0) - wp.float64(i) / wp.float64(steps))
         force = wp.float64(0.0)
         for tree in range(world, trees, worlds):
+            if cuts_out.cane[tree] >= 0:
+                depth = wp.float64(1.0) - gap / cuts_out.cane_diameter[tree]
+                force = force + force_at(depth, cuts_out.cane_force[tree], blade.power)
             for k in range(wood.tree_start[tree], wood.tree_start[tree + 1]):
                 bunch = wood.of_tree[k]
                 if cuts_out.segment[bunch] >= 0:
                     depth = wp.float64(1.0) - gap / cuts_out.diameter[bunch]
-                    if depth > wp.float64(0.0):
-                        force = force + cuts_out.force[bunch] * force_share(depth, blade.power)
+                    force = force + force_at(depth, cuts_out.force[bunch], blade.power)
         needed = wp.max(needed, force * blade.factor)
     needed_out[world] = wp.float32(needed)
     if needed > blade.force or not wp.isfinite(needed):
         for tree in range(world, trees, worlds):
+            cuts_out.cane[tree] = NONE
             for k in range(wood.tree_start[tree], wood.tree_start[tree + 1]):
                 bunch = wood.of_tree[k]
                 cuts_out.segment[bunch] = NONE

@@ -65,9 +65,10 @@ def respond_at_contacts(
     body of the last contact.
 
     This is the body's operational-space inverse inertia, computed by the recursion from the root (Featherstone 2008,
-    section 9.6; Kreutz-Delgado, Jain and Rodriguez 1992), for trees with a fixed root. With the parent's (a', alpha'),
-    the lever l and a = a' - l x alpha', the body has alpha = (1 - DJ) alpha' - DH a + D moment, where moment acts on
-    the body's joint. Contacts are in the order of their bodies. is_branching: [body] whether a body is the parent of a
+    section 9.6; Kreutz-Delgado, Jain and Rodriguez 1992). A root is treated as if it had a parent that can be pushed but
+    not turned, whose P is ``root_inverse_mass``: 0 for a fixed root. With the parent's (a', alpha'), the lever l and
+    a = a' - l x alpha', the body has alpha = (1 - DJ) alpha' - DH a + D moment, where moment acts on the body's joint.
+    Contacts are in the order of their bodies. is_branching: [body] whether a body is the parent of a
     body other than the next one.
     """
     tree = wp.tid()
@@ -91,7 +92,7 @@ def respond_at_contacts(
         DH = factors.DH[k]
         DJ = factors.DJ[k]
         if parent < 0:
-            P = wp.mat33()
+            P = factors.root_inverse_mass[k]
             Q = wp.mat33()
             R = wp.mat33()
         elif parent != k - model.pitch:

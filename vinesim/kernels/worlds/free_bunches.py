@@ -10,7 +10,7 @@ from vinesim.kernels.contact.body_motion import to_double, to_single
 from vinesim.kernels.contact.narrowphase_rigid import FAR, segment_geom_distance
 from vinesim.kernels.contact.structs import Capsules, Geoms, GeomStates, Hulls, PlantBodies, RigidBodies
 from vinesim.kernels.plants.energy_budget import NO_LIMIT
-from vinesim.kernels.worlds.cutting import NONE, Cuts, Wood
+from vinesim.kernels.worlds.cutting import NONE, WHOLE, Cuts, Wood
 from vinesim.kernels.worlds.narrowphase import FreeBunches
 from vinesim.kernels.worlds.reset import BUNCHES
 
@@ -314,11 +314,14 @@ def leave_capsules(
     body_parent: wp.array(dtype=wp.int32),
     capsules_out: Capsules,
 ):
-    """Remove the capsules of a bunch and its stalk from a tree, and shorten that of the stump to ``at`` [m]."""
+    """Remove the capsules of a bunch and its stalk from a tree, and shorten that of the stump to ``at`` [m].
+    ``segment``: :data:`WHOLE` for a bunch without stalk."""
     for s in range(tree, capsules_out.body.shape[0], trees):
         owner = capsules_out.body[s]
         if owner >= 0 and capsules_out.bunch[s] == bunch:
-            if owner == segment:
+            if segment == WHOLE:
+                capsules_out.body[s] = NONE
+            elif owner == segment:
                 share = at / capsules_out.local_end[s][0]
                 capsules_out.local_end[s] = share * capsules_out.local_end[s]
                 capsules_out.extent[s] = at + capsules_out.radius[s]
@@ -393,7 +396,8 @@ def detach_bunch(
     geoms_out: Geoms,
     rigid_out: RigidBodies,
 ):
-    """Move a bunch from its vine to a body of the pool, with the stalk beyond a cut ``at`` [m] along ``segment``."""
+    """Move a bunch from its vine to a body of the pool, with the stalk beyond a cut ``at`` [m] along ``segment``; without
+    stalk if this is :data:`WHOLE`."""
     zero = wp.float64(0.0)
     body = wood.bunch_body[bunch]
     frame = body_q[body]
@@ -415,6 +419,8 @@ def detach_bunch(
     row = pool.moving_geom[slot] + numbers.spheres
     pieces = int(0)
     k = body_parent[body]
+    if segment == WHOLE:
+        k = NONE
     while pieces < numbers.pieces:
         g = first + pieces
         geom_row = (row + pieces) * numbers.worlds + world
@@ -493,13 +499,13 @@ def detach_bunches(
         for i in range(wood.tree_start[tree], wood.tree_start[tree + 1]):
             bunch = wood.of_tree[i]
             segment = cuts.segment[bunch]
-            if segment >= 0 and slot >= slots:
+            if segment != NONE and slot >= slots:
                 before = faults_out[world]
                 faults_out[world] = before | BUNCHES
                 if before == 0:
                     fault_count_out[world] = fault_count_out[world] + 1
-            elif segment >= 0:
-                longest = wp.float64(wood.length[segment]) - numbers.shortest
+            elif segment != NONE:
+                longest = wp.float64(wood.length[wp.max(segment, 0)]) - numbers.shortest
                 at = wp.min(wp.max(cuts.at[bunch], numbers.shortest), longest)
                 at = wp.rint(at / numbers.place_step) * numbers.place_step
                 detach_bunch(

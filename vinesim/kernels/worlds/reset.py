@@ -14,6 +14,8 @@ ROOM = wp.constant(2)
 """Fault: contacts were left out because there was no room for them."""
 BUNCHES = wp.constant(4)
 """Fault: a bunch that was cut off hangs on, because no body of the pool was free."""
+STUMPS = wp.constant(8)
+"""Fault: a cane that was cut hangs on, because its tree has no spare body left for a stump."""
 NO_ROOM = wp.constant(15)
 """mujoco_warp's overflow flags NEFC, NJMAX_NNZ, BROADPHASE and NARROWPHASE."""
 
@@ -39,7 +41,7 @@ def find_faults(
 
     max_rate: largest rate of rigid bodies [m/s, rad/s]. fault_rate: largest rate of trees [rad/s]. overflow: [world]
     mujoco_warp's flags. dropped_before: [world] number of dropped contacts that is known. faults: [world] sum of
-    :data:`MOTION`, :data:`ROOM` and :data:`BUNCHES`. fault_count: [world] number of times that a world without faults got one.
+    :data:`MOTION`, :data:`ROOM`, :data:`BUNCHES` and :data:`STUMPS`. fault_count: [world] number of times that a world without faults got one.
     """
     world = wp.tid()
     moves_wrongly = bool(False)
@@ -78,6 +80,23 @@ def restore_rows(
     k, column = wp.tid()
     if resets[tree[k] % worlds]:
         rows_out[k, column] = start[k, column]
+
+
+@wp.kernel
+def restore_flags(
+    # in
+    worlds: int,
+    resets: wp.array(dtype=wp.bool),
+    tree: wp.array(dtype=wp.int32),
+    start: wp.array(dtype=wp.bool),
+    # out
+    flags_out: wp.array(dtype=wp.bool),
+):
+    """One thread per flag of an array with a flag for each body. Copy it from ``start`` if its world is reset. resets:
+    [world]. tree: [flag] tree that it belongs to."""
+    k = wp.tid()
+    if resets[tree[k] % worlds]:
+        flags_out[k] = start[k]
 
 
 @wp.kernel

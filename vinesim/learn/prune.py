@@ -1,0 +1,157 @@
+"""Task *prune*: cut a dormant cane above its second bud, with shears, without pressing buds and other canes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from vinesim.core import frames
+from vinesim.interaction.cutting_force import DORMANT_ENERGY_SHARE, DORMANT_STRENGTH
+from vinesim.kernels.graph import KernelLaunch
+from vinesim.kernels.learn import prune as kernels
+from vinesim.kernels.learn.episodes import draw_targets
+from vinesim.learn.arm import AXES, pruning_blade
+from vinesim.learn.arm_env import ArmEnv
+from vinesim.learn.shoots import DENSITY, SPACING
+from vinesim.learn.variation import Variation
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
+from vinesim.scene.model import Model
+from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.scene.spare_bodies import with_spares
+
+CANES = 2
+"""Number of canes of a world."""
+KEPT = 2
+"""Number of buds that shall stay."""
+INTERNODES = 16
+"""Number of internodes of a cane, each a body, with a bud at its tip."""
+LENGTH = (1.1, 1.5)
+"""[m] Length of a cane. GUESSED. A shorter one may swing too fast for a step of 10 ms."""
+DISTANCE = 0.85
+"""[m] Mean distance of the canes from the origin."""
+HEIGHT = 0.7
+"""[m] Mean height at which they grow."""
+TOLERANCE = 0.01
+"""[m] Largest distance of a cut from the middle of the internode. GUESSED: it leaves a stub of 3 to 5 cm."""
+BUD = 0.015
+"""[m] Distance from a bud within which a contact presses it. GUESSED: a bud is 5 to 10 mm long."""
+SLOTS = 32
+"""Contacts that the plants of a world can have at once."""
+
+
+class PruneEnv(ArmEnv):
+    """Prune one cane of two to two buds, in ``num_envs`` worlds with different canes.
+
+    Action [8], from -1 to 1: the speeds of the targets of the seven joints, in units of 1 rad/s, and the blade, which
+    closes at the end of the action if this component is above 0. The fingers stand for the bars of shears: they stay
+    open, 4.8 cm apart, and the blade cuts what is between their tips, across their plane. Dormant canes need the force
+    of :data:`~vinesim.interaction.cutting_force.DORMANT_STRENGTH`.
+
+    Observation [27] float32: positions [rad] of the seven joints; their rates [rad/s]; from the point between the
+    fingers to the middle of the internode between the second and the third bud of the wanted cane [m], in world axes;
+    the direction of the cane there; from the same point to that place of the other cane [m]; the sums of the forces on
+    the other cane, and within 1.5 cm of the first two buds of the wanted one [N]; and two numbers of which that of the
+    wanted cane is 1. Poses of canes are those of the end of the action.
+
+    Reward of an action: 10 at success, minus the distance of the place of the cut from the point between the fingers
+    [m], minus 0.02 for each newton on these buds and on the other cane, minus 0.01 for each unit of squared action.
+    Success: the wanted cane is cut within 10 mm of the middle of that internode. An episode ends at success. It ends
+    with a reward lower by 2 if a cane is cut elsewhere. It is truncated after 100 actions (4 s).
+
+    ``options``: arguments of :class:`~vinesim.learn.arm_env.ArmEnv`. Of the variation, the canes take thickness,
+    modulus and damping.
+    """
+
+    def __init__(self, num_envs: int = 1, **options: Any) -> None:
+        device = options.get("device", "cpu")
+        self._target = wp.zeros(max(num_envs, 1), dtype=wp.int32, device=device)
+        self._is_done = wp.zeros(max(num_envs, 1), dtype=wp.bool, device=device)
+        super().__init__(
+            canes,
+            2 * len(AXES) + 6 + 3 * (CANES - 1) + 2 + CANES,
+            num_envs,
+            actions=len(AXES) + 1,
+            blade=pruning_blade(),
+            slots=SLOTS,
+            parameters=PhysicsParameters(cutting_strength=DORMANT_STRENGTH, cutting_energy_share=DORMANT_ENERGY_SHARE),
+            **options,
+        )
+
+    def _moves(self) -> list[KernelLaunch]:
+        pool = self.worlds.pool
+        assert pool is not None, "the arm has a blade"
+        given = [len(AXES), self._action]
+        return [*super()._moves(), KernelLaunch(kernels.close_blade, given, [pool.closing], threads=self.num_envs)]
+
+    def _beginnings(self) -> list[KernelLaunch]:
+        given = [CANES, self._seed, self._begins]
+        return [KernelLaunch(draw_targets, given, [self._episode, self._target], threads=self.num_envs)]
+
+    def _judgements(self, results: Any) -> list[KernelLaunch]:
+        given = [self._numbers(), self.num_envs, self._places(), self._target]
+        judge = KernelLaunch(kernels.judge_cuts, given, [self._is_done, self._failed], threads=self.num_envs)
+        return [judge, *super()._judgements(results)]
+
+    def _observations(self, observation: wp.array, reward: wp.array, success: wp.array) -> list[KernelLaunch]:
+        arrays = self.arm_arrays
+        given = [self._numbers(), self.num_envs, arrays.arm, self._places(), self._target, self._is_done]
+        given += [self._given_action, arrays.contacts, arrays.world_contacts]
+        return [KernelLaunch(kernels.observe, given, [observation, reward, success], threads=self.num_envs)]
+
+    def _numbers(self) -> kernels.PruneNumbers:
+        numbers = kernels.PruneNumbers()
+        numbers.tolerance = TOLERANCE
+        numbers.bud = BUD
+        numbers.success_reward = 10.0
+        numbers.distance_cost = 1.0
+        numbers.force_cost = 0.02
+        numbers.action_cost = 0.01
+        return numbers
+
+    def _places(self) -> kernels.CanePlaces:
+        plants = self.worlds.plants
+        pool = self.worlds.pool
+        assert pool is not None, "the arm has a blade"
+        model = self.worlds.model
+        base = np.zeros(plants.buffers.slot_count, np.float32)
+        base[plants.buffers.slots] = _distances(model)
+        arrays = plants.launches.resident_arrays
+        places = kernels.CanePlaces()
+        places.first = arrays["tree_first"]
+        places.size = arrays["tree_size"]
+        places.pitch = plants.buffers.pitch
+        places.kept = KEPT
+        places.base = self.on_device(base, float)
+        places.body_q = arrays["body_q"]
+        places.parts, places.is_cut = pool.canes.parts
+        places.length = places.parts.length
+        return places
+
+
+def _distances(model: Model) -> np.ndarray:
+    """Returns the distance [body] m along each cane from its base to a body."""
+    along = np.zeros(len(model.body_mass))
+    for number in range(1, INTERNODES):
+        body = model.tree_first + number
+        along[body] = along[body - 1] + model.body_length[body - 1]
+    return along
+
+
+def canes(rng: np.random.Generator, variation: Variation) -> Model:
+    """Returns :data:`CANES` upright dormant canes in front of the arm. Places and directions are GUESSED."""
+    side = SPACING * (np.arange(CANES) - 0.5 * (CANES - 1))
+    return with_spares(assemble([_cane(rng, float(y), variation) for y in side]), 1)
+
+
+def _cane(rng: np.random.Generator, side: float, variation: Variation) -> TreeBuilder:
+    near = np.array([0.04, 0.03, 0.06])
+    tree = TreeBuilder(frames.pose(np.array([DISTANCE, side, HEIGHT]) + rng.uniform(-near, near)))
+    radius = 0.5 * rng.uniform(*variation.thickness)
+    modulus = rng.uniform(*variation.modulus)
+    wood = RodMaterial(modulus, DENSITY, rng.uniform(*variation.damping), shear_modulus=0.4 * modulus)
+    up = frames.from_x_axis(np.array([*rng.uniform(-0.2, 0.2, 2), 1.0]))
+    tree.add_rod(-1, rng.uniform(*LENGTH), (radius, 0.6 * radius), wood, INTERNODES, rest=up)
+    tree.solve_rest_pose()
+    return tree
