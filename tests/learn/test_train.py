@@ -42,7 +42,7 @@ def test_options_that_do_not_fit_are_refused_in_one_line(tmp_path: pathlib.Path)
     for task, out, full, message in (
         ("reach", None, False, "give --out FOLDER to train, or --evaluate FILE"),
         ("reach", tmp_path / "run", True, "--full-physics without --evaluate"),
-        ("swim", tmp_path / "run", False, "no task 'swim'; give reach or expose"),
+        ("swim", tmp_path / "run", False, "no task 'swim'; give one of reach, expose, pick"),
     ):
         with pytest.raises(UsageError, match=message):
             run_training(task, out, 4, full=full, **training)

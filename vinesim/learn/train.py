@@ -36,7 +36,6 @@ PPO: dict[str, Any] = {
     "learning_rate": 1e-3,
     "schedule": "adaptive",
     "desired_kl": 0.01,
-    "gamma": 0.98,
     "lam": 0.95,
     "entropy_coef": 0.002,
     "num_learning_epochs": 5,
@@ -110,8 +109,10 @@ class Training:
         self.curve: list[Progress] = []
         self._origin = {"task": task, "seed": seed, "worlds": worlds, "vinesim": __version__}
         torch.manual_seed(seed)
-        env = environment(task)(
-            worlds, device=device, arrays="torch", vines_seed=seed, vines=VINES, variation=variation
+        make = environment(task)
+        share = make.task_class.on_way
+        env = make(
+            worlds, device=device, arrays="torch", vines_seed=seed, vines=VINES, variation=variation, on_way=share
         )  # fmt: skip
         env.reset(seed=seed)
         env.step(torch.zeros(env.num_envs, env.num_actions, device=device))  # the first step compiles the kernels
@@ -131,7 +132,7 @@ class Training:
             "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
             "actor": network | {"distribution_cfg": actions},
             "critic": network,
-            "algorithm": PPO,
+            "algorithm": PPO | {"gamma": env.task_class.discount},
         }
         with contextlib.redirect_stdout(io.StringIO()):  # it prints its networks
             self._runner = OnPolicyRunner(self._env, config, log_dir=None, device=device)
