@@ -1,8 +1,10 @@
 """Task *pick*: grasp a bunch by its stalk, cut it off above the fingers, and hold it.
 
-The reward is shaped by a potential of the state: an action adds the discounted potential after it minus the potential
-before it. A potential changes no optimal policy (Ng, Harada, Russell 1999, "Policy invariance under reward
-transformations"), so that no state is worth staying in. After the end of an episode it is 0.
+An action is rewarded by the progress that it makes: the potential of the state after it minus that before it. Waiting
+makes no progress, wherever the hand is, and costs time. The potential is not discounted: with discounted potentials,
+which change no policy's advantage over another one (Ng, Harada, Russell 1999, "Policy invariance under reward
+transformations"), a training learned nothing of the way to the stalk, since a policy that only waits earns the less the
+nearer it waits.
 """
 
 from __future__ import annotations
@@ -131,7 +133,7 @@ class Pick(ArmTask):
         """See :meth:`ArmTask.observe`."""
         arrays = self.arrays
         given = [self._numbers(), arrays.worlds, arrays.fingers, arrays.arm, arrays.places, self.wanted]
-        given += [self._held, self.failed, self._commanded, action, arrays.contacts, arrays.world_contacts]
+        given += [self._held, self._commanded, action, arrays.contacts, arrays.world_contacts]
         written = [self._potential, observation, reward, success]
         return KernelLaunch(kernels.observe, given, written, threads=arrays.worlds)
 
@@ -146,7 +148,6 @@ class Pick(ArmTask):
         numbers.time_cost = TIME_COST
         numbers.force_cost = 0.02
         numbers.action_cost = ACTION_COST
-        numbers.discount = self.discount
         numbers.place = wp.vec3(*PLACE)
         numbers.distance_worth = DISTANCE_WORTH
         numbers.tilt_worth = TILT_WORTH
@@ -174,10 +175,10 @@ class PickEnv(ArmEnv):
     wanted bunch is 1.
 
     Reward of an action: 10 at success, minus 0.02, minus 0.02 for each newton on the other shoot, minus 0.001 for each
-    unit of squared action, plus 0.99 times the potential of the state after it, minus that of the state before it. The
-    potential is -10 for each metre from the stalk to a place 2 cm behind the tips of the fingers, minus 2 for each unit
-    of 1 - the cosine of the angle between the stalk and the hand's vertical axis, plus 3 times how far the fingers have
-    closed (1: they touch) with the stalk between them. It is 0 after success and after a failure.
+    unit of squared action, plus the potential of the state after it, minus that of the state before it. The potential
+    is -10 for each metre from the stalk to a place 2 cm behind the tips of the fingers, minus 2 for each unit of 1 -
+    the cosine of the angle between the stalk and the hand's vertical axis, plus 3 times how far the fingers have closed
+    (1: they touch) with the stalk between them.
 
     Success: the bunch has been held for 0.2 s: it is off the vine, its stalk is less than 5 cm from the point between
     the fingers, and its middle moves by less than 0.1 m/s. An episode ends at success. It fails, and ends with a reward

@@ -33,8 +33,6 @@ class PickNumbers:
     force_cost: float
     """[1/N] Cost of an action per force on other plants."""
     action_cost: float
-    discount: float
-    """Discount of an action."""
     place: wp.vec3
     """[m] Where the stalk shall be in the hand, from the point between the tips of the fingers."""
     distance_worth: float
@@ -236,7 +234,6 @@ def observe(
     bunches: BunchPlaces,
     target: wp.array(dtype=wp.int32),
     held: wp.array(dtype=wp.int32),
-    failed: wp.array(dtype=wp.bool),
     commanded: wp.array(dtype=wp.int32),
     action: wp.array2d(dtype=float),
     contacts: Contacts,
@@ -250,7 +247,7 @@ def observe(
     """One thread per world.
 
     fingers: [2] indices of the left and the right finger in MuJoCo's qpos. target: [world] number of the tree whose bunch
-    is wanted, in its world. held, failed: see :func:`count_held`. commanded: see :func:`move_hand`. potential: [world] of
+    is wanted, in its world. held: see :func:`count_held`. commanded: see :func:`move_hand`. potential: [world] of
     the state, by which rewards are shaped. observation: [world, k], as :class:`vinesim.learn.pick.PickEnv` describes it.
     """
     world = wp.tid()
@@ -296,9 +293,6 @@ def observe(
     reward = -numbers.time_cost - numbers.force_cost * force - numbers.action_cost * effort
     if success:
         reward = reward + numbers.success_reward
-    reward = reward - potential_out[world]
-    if not (success or failed[world]):
-        reward = reward + numbers.discount * potential
+    reward_out[world] = reward + potential - potential_out[world]
     potential_out[world] = potential
-    reward_out[world] = reward
     success_out[world] = success
