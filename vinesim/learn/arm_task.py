@@ -43,6 +43,8 @@ class ArmTask(abc.ABC):
     discount: ClassVar[float] = 0.98
     """Discount of an action for which the rewards are made. TUNED on the task reach."""
 
+    noise: ClassVar[float] = 1.0
+    """Standard deviation of the actions that a training first explores."""
     on_way: ClassVar[float] = 0.0
     """Share of the episodes of a training that begin on the way to :meth:`goals`."""
 

@@ -124,7 +124,7 @@ class Training:
             "activation": "elu",
             "obs_normalization": True,
         }
-        actions = {"class_name": "GaussianDistribution", "init_std": 1.0, "std_type": "log"}
+        actions = {"class_name": "GaussianDistribution", "init_std": env.task_class.noise, "std_type": "log"}
         config = {
             "num_steps_per_env": ACTIONS,
             "save_interval": 1,  # nothing is saved without a folder for logs

@@ -41,6 +41,9 @@ class PickNumbers:
     """Potential lost per 1 - the cosine of the angle between the stalk and the hand's vertical axis."""
     grasp_worth: float
     """Potential of closed fingers with the stalk between them."""
+    cut_worth: float
+    """Further potential of this grasp once the bunch is off; before, the share of it for which the blade has been
+    commanded."""
     finger: wp.vec3
     """[m] Edges of a finger, in the hand's axes. Its tip is at the point between the tips."""
     gap: float
@@ -285,7 +288,8 @@ def observe(
         observation_out[world, place + 1 + k] = wp.where(k == wanted, 1.0, 0.0)
     left = arm.qpos[world, fingers[0]]
     right = arm.qpos[world, fingers[1]]
-    potential = numbers.grasp_worth * grasp_share(in_hand, left, right, numbers)
+    cut = wp.where(slot < 0, float(commanded[world]) / float(numbers.trigger), 1.0)
+    potential = (numbers.grasp_worth + numbers.cut_worth * cut) * grasp_share(in_hand, left, right, numbers)
     potential = potential - numbers.distance_worth * wp.length(in_hand - numbers.place)
     potential = potential - numbers.tilt_worth * (1.0 + axis[2])
     success = held[world] >= numbers.actions
