@@ -75,7 +75,7 @@ class Picking(Controller):
         q = observation[:7]
         opening = observation[14]
         to_stalk = observation[15:18]
-        hangs = observation[21] == 1.0
+        hangs = observation[21] < 1.0
         ahead = self._arm.ahead(q, self._arm.point(q) + to_stalk)
         aside = np.linalg.norm(to_stalk - (to_stalk @ ahead) * ahead)
         is_in_front = aside < 0.03 and to_stalk @ ahead < 0.09

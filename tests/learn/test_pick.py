@@ -21,10 +21,10 @@ from vinesim.scene.state import State
 pytestmark = pytest.mark.slow
 OPENING = 14
 STALK = slice(15, 18)
-HANGS = 21
+CUT = 21
+"""How far the bunch is cut off; 1: it is off."""
 IN_HAND = slice(22, 25)
 AXIS = slice(25, 28)
-COMMANDED = 28
 BLADE = 8
 
 
@@ -46,11 +46,11 @@ def directions(env: Any, observation: np.ndarray) -> np.ndarray:
 def test_nothing_happens_to_a_bunch_if_nothing_is_done(environment: Any) -> None:
     observation, _ = environment.reset(seed=1)
     assert environment.observation_space.contains(observation)
-    assert (observation[:, HANGS] == 1.0).all()
+    assert (observation[:, CUT] < 1.0).all()
     for _ in range(150):
         observation, reward, terminated, truncated, info = environment.step(np.zeros((2, 9), np.float32))
         seen = info.get("final_obs", observation)
-        assert (seen[:, HANGS] == 1.0).all()
+        assert (seen[:, CUT] < 1.0).all()
         assert (reward < 0.0).all()
         assert not terminated.any()
     assert truncated.all()
@@ -78,7 +78,7 @@ def pick(env: Any, seed: int) -> tuple[np.ndarray, np.ndarray]:
         action = policy(observation)
         observation, reward, terminated, _, info = env.step(action)
         seen = info.get("final_obs", observation)
-        for world in np.flatnonzero(running & (seen[:, HANGS] == 0.0) & (cut_at < 0)):
+        for world in np.flatnonzero(running & (seen[:, CUT] == 1.0) & (cut_at < 0)):
             cut_at[world] = k
             assert action[world, BLADE] > 0.0
         for world in np.flatnonzero(running & info["success"]):
@@ -86,7 +86,7 @@ def pick(env: Any, seed: int) -> tuple[np.ndarray, np.ndarray]:
             assert reward[world] > 9.0
             assert terminated[world]
             assert np.linalg.norm(seen[world, STALK]) < 0.05
-            assert observation[world, HANGS] == 1.0, "the next episode begins with a bunch that hangs"
+            assert observation[world, CUT] == 0.0, "the next episode begins with a bunch that hangs"
         running &= ~terminated
         if not running.any():
             break
@@ -101,8 +101,7 @@ def potential(seen: np.ndarray) -> np.ndarray:
     along = (place[:, 0] < 0.0) & (place[:, 0] > -0.08) & (np.abs(place[:, 2]) < 0.024)
     grasp = np.where(along & (np.abs(place[:, 1]) < 0.5 * width + 0.003), 1.0 - width / 0.108, 0.0)
     distance = np.linalg.norm(place - [-0.02, 0.0, 0.0], axis=1)
-    cut = np.where(seen[:, HANGS] == 1.0, seen[:, COMMANDED], 1.0)
-    return (3.0 + 2.0 * cut) * grasp - 10.0 * distance - 2.0 * (1.0 + seen[:, AXIS][:, 2])
+    return (3.0 + 2.0 * seen[:, CUT]) * grasp - 10.0 * distance - 2.0 * (1.0 + seen[:, AXIS][:, 2])
 
 
 def test_the_reward_is_the_gain_of_the_potential_of_what_is_seen(environment: Any) -> None:
@@ -118,7 +117,7 @@ def test_the_reward_is_the_gain_of_the_potential_of_what_is_seen(environment: An
             break
         costs = 0.02 + 0.02 * observation[:, -3] + 0.001 * (action**2).sum(1)
         np.testing.assert_allclose(reward, potential(observation) - before - costs, atol=0.01)
-        cut = cut or bool((observation[:, HANGS] == 0.0).any())
+        cut = cut or bool((observation[:, CUT] == 1.0).any())
     assert cut
 
 
@@ -178,7 +177,7 @@ def test_the_blade_closes_after_five_commands_in_a_row(environment: Any) -> None
         assert (needed.numpy()[0] >= 0.0) == (k == 9)
         assert needed.numpy()[1] == -1.0
         expected = 0.0 if k in (4, 9) else 0.2 * (k + 1 if k < 4 else k - 4)
-        np.testing.assert_allclose(observation[:, COMMANDED], [expected, 0.0], atol=1e-6)
+        np.testing.assert_allclose(observation[:, CUT], [expected, 0.0], atol=1e-6)
     assert not closing.numpy().any()
 
 
@@ -202,7 +201,7 @@ def test_a_bunch_that_is_cut_but_not_held_is_no_success(environment: Any) -> Non
     over = np.zeros(2, bool)
     for _ in range(110):
         ways = observation[:, STALK] + 0.01 * ahead
-        hangs = observation[:, HANGS] == 1.0
+        hangs = observation[:, CUT] < 1.0
         action = np.zeros((2, 9), np.float32)
         action[:, :7] = np.where(hangs[:, None], towards(environment, ways, 8.0, ahead), 0.0)
         action[:, 7] = -0.5
@@ -211,7 +210,7 @@ def test_a_bunch_that_is_cut_but_not_held_is_no_success(environment: Any) -> Non
         assert not info["success"].any()
         for world in np.flatnonzero(terminated & ~over):
             last = info["final_obs"][world]
-            assert last[HANGS] == 0.0
+            assert last[CUT] == 1.0
             assert np.linalg.norm(last[STALK]) > 0.2
             assert reward[world] < -2.0
             over[world] = True

@@ -68,7 +68,7 @@ def pick(env: ArmEnv, observation: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("task", "control", "force", "rough"),
-    [(Reach, push, 26, []), (Expose, push, 21, [20]), (Pick, pick, 32, [])],
+    [(Reach, push, 26, []), (Expose, push, 21, [20]), (Pick, pick, 31, [])],
 )
 def test_a_client_and_a_batch_observe_and_act_alike(
     task: type[ArmTask], control: Callable[[ArmEnv, np.ndarray], np.ndarray], force: int, rough: list[int]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import mujoco
 import numpy as np
 
+from vinesim.core import frames
 from vinesim.learn.arm import AXES, JOINT_LIMIT, TOOL, TOOL_LINK
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene.model import Model
@@ -32,23 +32,17 @@ class ArmKinematics:
     """
 
     def __init__(self, model: Model, robot: RobotSpec) -> None:
-        rigid = RigidWorld(model, parameters=PhysicsParameters(bunch_pool_size=0))
-        rigid.add_robot(robot)
-        self._m = rigid.mj_model
-        self._d = mujoco.MjData(self._m)
-        self._d.qpos[:] = rigid.mj_data.qpos
-        arm = rigid.robot("arm")
-        self._q = arm.q[: len(AXES)]
-        self._v = arm.v[: len(AXES)]
-        self._tool = arm.bodies[TOOL_LINK]
-        self._first = arm.bodies["link_0"]
+        self._rigid = RigidWorld(model, parameters=PhysicsParameters(bunch_pool_size=0))
+        self._rigid.add_robot(robot)
+        self._q = self._rigid.robot("arm").q[: len(AXES)]
 
     def _pose(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the point between the fingers [3] m, and the axes [3, 3] of the hand."""
-        self._d.qpos[self._q] = q
-        mujoco.mj_kinematics(self._m, self._d)
-        axes = self._d.xmat[self._tool].reshape(3, 3)
-        return self._d.xpos[self._tool] + axes @ np.array(TOOL), axes
+        self._rigid.mj_data.qpos[self._q] = q
+        self._rigid.invalidate_kinematics()
+        pose = self._rigid.link_pose("arm", TOOL_LINK)
+        axes = frames.to_matrix(pose[3:])
+        return pose[:3] + axes @ np.array(TOOL), axes
 
     def point(self, q: np.ndarray) -> np.ndarray:
         """Returns the point between the fingers [3] m at the positions ``q`` [7] rad of the joints."""
@@ -57,7 +51,7 @@ class ArmKinematics:
     def ahead(self, q: np.ndarray, point: np.ndarray) -> np.ndarray:
         """Returns the horizontal unit vector [3] from the arm's first joint to a ``point`` [3] m."""
         self._pose(q)
-        way = (point - self._d.xpos[self._first]) * [1.0, 1.0, 0.0]
+        way = (point - self._rigid.link_pose("arm", "link_0")[:3]) * [1.0, 1.0, 0.0]
         return way / np.linalg.norm(way)
 
     def step(self, q: np.ndarray, way: np.ndarray, ahead: np.ndarray | None = None) -> np.ndarray:
@@ -65,12 +59,10 @@ class ArmKinematics:
         ``way`` [3] m. ``ahead`` [3]: horizontal direction into which the upright hand turns; None: it turns as it
         likes."""
         point, axes = self._pose(q)
-        mujoco.mj_comPos(self._m, self._d)
-        jacobian = np.zeros((6, self._m.nv))
-        mujoco.mj_jac(self._m, self._d, jacobian[:3], jacobian[3:], point, self._tool)
-        J = jacobian[:3, self._v]
+        whole = self._rigid.jacobian("arm", TOOL_LINK, point)[:, : len(AXES)]
+        J = whole[:3]
         if ahead is not None:
-            J = np.concatenate([J, LEVER * jacobian[3:, self._v]])
+            J = np.concatenate([J, LEVER * whole[3:]])
             way = np.concatenate([way, LEVER * turn_upright(axes, ahead)])
         return J.T @ np.linalg.solve(J @ J.T + DAMPING * np.eye(len(J)), way)
 

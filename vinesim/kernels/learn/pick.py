@@ -42,8 +42,7 @@ class PickNumbers:
     grasp_worth: float
     """Potential of closed fingers with the stalk between them."""
     cut_worth: float
-    """Further potential of this grasp once the bunch is off; before, the share of it for which the blade has been
-    commanded."""
+    """Further potential of this grasp, times how far the bunch is cut off."""
     finger: wp.vec3
     """[m] Edges of a finger, in the hand's axes. Its tip is at the point between the tips."""
     gap: float
@@ -266,15 +265,17 @@ def observe(
     for k in range(3):
         observation_out[world, place + 1 + k] = to_stalk[k]
         observation_out[world, place + 4 + k] = to_middle[k]
-    observation_out[world, place + 7] = wp.where(slot < 0, 1.0, 0.0)
+    # one number that varies: a flag that is nearly constant would be scaled to 100 deviations when it changes, and a
+    # policy that has learned to grasp then lets the bunch go
+    cut = wp.where(slot < 0, float(commanded[world]) / float(numbers.trigger), 1.0)
+    observation_out[world, place + 7] = cut
     to_hand = wp.transpose(arm.xmat[world, arm.tool_body])
     in_hand = to_hand * to_stalk
     axis = to_hand * stalk_axis(world, tree, slot, bunches)
     for k in range(3):
         observation_out[world, place + 8 + k] = in_hand[k]
         observation_out[world, place + 11 + k] = axis[k]
-    observation_out[world, place + 14] = float(commanded[world]) / float(numbers.trigger)
-    place = place + 15
+    place = place + 14
     for other in range(trees):
         if other != wanted:
             tree = other * worlds + world
@@ -288,7 +289,6 @@ def observe(
         observation_out[world, place + 1 + k] = wp.where(k == wanted, 1.0, 0.0)
     left = arm.qpos[world, fingers[0]]
     right = arm.qpos[world, fingers[1]]
-    cut = wp.where(slot < 0, float(commanded[world]) / float(numbers.trigger), 1.0)
     potential = (numbers.grasp_worth + numbers.cut_worth * cut) * grasp_share(in_hand, left, right, numbers)
     potential = potential - numbers.distance_worth * wp.length(in_hand - numbers.place)
     potential = potential - numbers.tilt_worth * (1.0 + axis[2])
