@@ -110,7 +110,8 @@ def begin_on_way(
             way = wp.randf(state)
             for i in range(q.shape[0]):
                 angle = home[i] + way * (goals[world, target[world], i] - home[i])
-                qpos_out[world, q[i]] = angle
+                at = q[i]
+                qpos_out[world, at] = angle
                 targets_out[world, i] = angle
 
 
