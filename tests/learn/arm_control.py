@@ -13,6 +13,8 @@ from vinesim.learn.variation import Variation
 
 GAIN = 8.0
 """Action per rad that a joint is to turn."""
+OPEN = 0.03
+"""[m] Opening of the fingers with which the hand comes to a stalk."""
 CLOSED_ON_STALK = -0.04
 """[m] Opening of the fingers below which they have closed: a stalk of 4 mm leaves -0.044 m."""
 
@@ -84,7 +86,7 @@ class Picking(Controller):
         action = np.zeros(9)
         if hangs and not is_around and not is_closing:
             action[:7] = GAIN * self._arm.step(q, to_stalk + (0.01 if is_in_front else -0.05) * ahead, ahead)
-            action[7] = -0.5
+            action[7] = -0.5 if opening < OPEN else 0.0
         else:
             action[7] = 1.0
             action[8] = hangs and opening < CLOSED_ON_STALK

@@ -58,7 +58,7 @@ def test_nothing_happens_to_a_bunch_if_nothing_is_done(environment: Any) -> None
 
 def test_the_fingers_open_and_close_with_their_action(environment: Any) -> None:
     environment.reset(seed=1)
-    for grip, opening in ((-1.0, 0.06), (1.0, -0.048), (0.0, 0.004)):
+    for grip, opening in ((-1.0, 0.06), (0.1, 0.06), (1.0, -0.048), (-0.1, -0.048), (-0.3, 0.06)):
         action = np.zeros((2, 9), np.float32)
         action[:, 7] = grip
         for _ in range(20):

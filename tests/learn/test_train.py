@@ -120,6 +120,21 @@ def test_a_training_writes_its_policy_its_curve_and_a_summary(tmp_path: pathlib.
 
 @pytest.mark.gpu
 @pytest.mark.slow
+def test_the_noise_of_a_training_of_pick_falls() -> None:
+    pytest.importorskip("rsl_rl")
+    from vinesim.learn.pick import Pick
+    from vinesim.learn.train import LEAST_NOISE, Training
+
+    training = Training("pick", 2, seed=3)
+    deviations = training._runner.alg.get_policy().distribution.log_std_param
+    np.testing.assert_allclose(deviations.exp().tolist(), Pick.noise, rtol=1e-5)
+    for largest, expected in ((0.3, 0.3), (0.5, 0.3), (0.01, LEAST_NOISE)):
+        training._limit_noise(largest)
+        np.testing.assert_allclose(deviations.exp().tolist(), expected, rtol=1e-5)
+
+
+@pytest.mark.gpu
+@pytest.mark.slow
 def test_success_counts_episodes_not_actions() -> None:
     """Two episodes of three actions each end without success; a further one was not ended."""
     pytest.importorskip("rsl_rl")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import math
 from typing import ClassVar
 
 import numpy as np
@@ -45,6 +46,8 @@ class ArmTask(abc.ABC):
 
     noise: ClassVar[float] = 1.0
     """Standard deviation of the actions that a training first explores."""
+    calm: ClassVar[float] = math.inf
+    """Number of iterations in which this deviation falls to 1/e of what it was, or below."""
     on_way: ClassVar[float] = 0.0
     """Share of the episodes of a training that begin on the way to :meth:`goals`."""
 

@@ -35,6 +35,8 @@ SLOTS = 32
 """Contacts that the plants of a world can have at once: fingers around a stalk have up to 16, the bunch more."""
 FINGER_SPEED = 0.15
 """[m/s] Speed of the targets of the fingers. GUESSED."""
+DEAD = 0.2
+"""Command of the fingers up to which they stay. GUESSED: the noise of a training lets a bunch fall less often."""
 TRIGGER = 5
 """Number of actions, 0.2 s, for which the blade must be commanded until it closes. GUESSED, as a guard against cuts by
 accident: an action of noise about 0 closes the blade once in 62 actions, not in every second one."""
@@ -79,8 +81,9 @@ class Pick(ArmTask):
     actions = len(AXES) + 2
     max_steps = 150
     choices = SHOOTS
-    noise = 0.5
-    """GUESSED: with 1, the noise alone moves the hand by 4 cm in an action, and fingers cannot stay around a stalk."""
+    noise = 0.6
+    calm = 150
+    """GUESSED: noise of 0.5 shakes a bunch in the hand by more than :data:`SPEED`, so that no success is ever seen."""
     on_way = 0.5
     """GUESSED."""
     discount = 0.99
@@ -120,7 +123,7 @@ class Pick(ArmTask):
     def moves(self, action: wp.array, dt: float) -> list[KernelLaunch]:
         """See :meth:`ArmTask.moves`."""
         arrays = self.arrays
-        given = [CLOSED, -FINGER_WAY, FINGER_SPEED * STEPS * dt, len(AXES), TRIGGER, action]
+        given = [CLOSED, -FINGER_WAY, FINGER_SPEED * STEPS * dt, DEAD, len(AXES), TRIGGER, action]
         written = [arrays.targets, self._commanded, arrays.closing]
         return [*super().moves(action, dt), KernelLaunch(kernels.move_hand, given, written, threads=arrays.worlds)]
 
@@ -168,10 +171,10 @@ class Pick(ArmTask):
 class PickEnv(ArmEnv):
     """Pick one bunch of two, in ``num_envs`` worlds with different shoots.
 
-    Action [9], from -1 to 1: the speeds of the targets of the seven joints, in units of 1 rad/s; where the fingers
-    go, from open (-1) to closed (1), at 0.15 m/s; and the blade, which closes at the end of an action if this
-    component has been above 0 for five actions in a row. The hand grasps the stalk of a bunch between its fingers, and
-    the blade cuts above them. The bunch then hangs from the fingers.
+    Action [9], from -1 to 1: the speeds of the targets of the seven joints, in units of 1 rad/s; whether the fingers
+    close (above 0.2), open (below -0.2) or stay, at 0.15 m/s; and the blade, which closes at the end of an action if
+    this component has been above 0 for five actions in a row. The hand grasps the stalk of a bunch between its fingers,
+    and the blade cuts above them. The bunch then hangs from the fingers.
 
     Observation [34] float32: positions [rad] of the seven joints; their rates [rad/s]; how much farther apart the
     fingers are than in the middle of their way [m]; from the point between the fingers to the middle of the wanted

@@ -137,6 +137,7 @@ def move_hand(
     closed: float,
     open: float,
     step: float,
+    dead: float,
     first: int,
     trigger: int,
     # in
@@ -149,15 +150,18 @@ def move_hand(
     """One thread per world. Set the targets of both fingers and the command of the blade by the components ``first`` and
     ``first + 1`` of the action.
 
-    closed, open: [m] where the targets of the fingers go at the action's ends 1 and -1, as distances from the middle of
-    their ways. step: [m] largest motion of a target in an action. targets: [world, joint]; the fingers are the joints
-    ``first`` (left) and ``first + 1`` (right). commanded: [world] for how many actions in a row the blade has been
-    commanded; it closes after ``trigger`` of them.
+    closed, open: [m] ends of the ways of the targets of the fingers, as distances from the middle of their ways. They
+    move by ``step`` [m] if the component is above ``dead`` or below -``dead``. targets: [world, joint]; the fingers are
+    the joints ``first`` (left) and ``first + 1`` (right). commanded: [world] for how many actions in a row the blade has
+    been commanded; it closes after ``trigger`` of them.
     """
     world = wp.tid()
-    share = 0.5 * (1.0 + wp.clamp(action[world, first], -1.0, 1.0))
-    before = targets_out[world, first + 1]
-    way = wp.clamp(open + share * (closed - open), before - step, before + step)
+    command = action[world, first]
+    way = targets_out[world, first + 1]
+    if command > dead:
+        way = wp.min(way + step, closed)
+    if command < -dead:
+        way = wp.max(way - step, open)
     targets_out[world, first] = -way
     targets_out[world, first + 1] = way
     commanded = int(0)
