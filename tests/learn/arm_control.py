@@ -15,6 +15,8 @@ GAIN = 8.0
 """Action per rad that a joint is to turn."""
 OPEN = 0.03
 """[m] Opening of the fingers with which the hand comes to a stalk."""
+BELOW = 0.012
+"""[m] How far below the middle of a stalk the hand grasps it, so that the cane above is not in the blade's mouth."""
 CLOSED_ON_STALK = -0.04
 """[m] Opening of the fingers below which they have closed: a stalk of 4 mm leaves -0.044 m."""
 
@@ -77,17 +79,17 @@ class Picking(Controller):
         q = observation[:7]
         opening = observation[14]
         to_stalk = observation[15:18]
-        hangs = observation[21] < 1.0
         ahead = self._arm.ahead(q, self._arm.point(q) + to_stalk)
         aside = np.linalg.norm(to_stalk - (to_stalk @ ahead) * ahead)
         is_in_front = aside < 0.03 and to_stalk @ ahead < 0.09
-        is_around = np.linalg.norm(to_stalk + 0.01 * ahead) < 0.012
+        around = to_stalk + 0.01 * ahead - [0.0, 0.0, BELOW]
+        is_around = np.linalg.norm(around) < 0.012
         is_closing = np.linalg.norm(to_stalk) < 0.035 and opening < 0.02
         action = np.zeros(9)
-        if hangs and not is_around and not is_closing:
-            action[:7] = GAIN * self._arm.step(q, to_stalk + (0.01 if is_in_front else -0.05) * ahead, ahead)
+        if not is_around and not is_closing:
+            action[:7] = GAIN * self._arm.step(q, around if is_in_front else to_stalk - 0.05 * ahead, ahead)
             action[7] = -0.5 if opening < OPEN else 0.0
         else:
             action[7] = 1.0
-            action[8] = hangs and opening < CLOSED_ON_STALK
+            action[8] = opening < CLOSED_ON_STALK
         return action

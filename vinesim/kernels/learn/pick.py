@@ -269,10 +269,8 @@ def observe(
     for k in range(3):
         observation_out[world, place + 1 + k] = to_stalk[k]
         observation_out[world, place + 4 + k] = to_middle[k]
-    # one number that varies: a flag that is nearly constant would be scaled to 100 deviations when it changes, and a
-    # policy that has learned to grasp then lets the bunch go
-    cut = wp.where(slot < 0, float(commanded[world]) / float(numbers.trigger), 1.0)
-    observation_out[world, place + 7] = cut
+    share = float(commanded[world]) / float(numbers.trigger)
+    observation_out[world, place + 7] = share
     to_hand = wp.transpose(arm.xmat[world, arm.tool_body])
     in_hand = to_hand * to_stalk
     axis = to_hand * stalk_axis(world, tree, slot, bunches)
@@ -293,6 +291,7 @@ def observe(
         observation_out[world, place + 1 + k] = wp.where(k == wanted, 1.0, 0.0)
     left = arm.qpos[world, fingers[0]]
     right = arm.qpos[world, fingers[1]]
+    cut = wp.where(slot < 0, share, 1.0)
     potential = (numbers.grasp_worth + numbers.cut_worth * cut) * grasp_share(in_hand, left, right, numbers)
     potential = potential - numbers.distance_worth * wp.length(in_hand - numbers.place)
     potential = potential - numbers.tilt_worth * (1.0 + axis[2])
