@@ -16,6 +16,7 @@ pytest.importorskip("vinesim.learn")
 import gymnasium
 
 from tests.learn.arm_control import towards
+from vinesim.learn.reach import ReachEnv
 from vinesim.learn.variation import Variation
 
 pytestmark = pytest.mark.slow
@@ -178,3 +179,55 @@ def test_bad_arguments_are_named():
 def test_without_pytorch_the_message_says_what_to_install():
     with pytest.raises(ImportError, match="pip install torch"):
         gymnasium.make_vec("vinesim/Reach-v0", num_envs=1, arrays="torch")
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (np.array([2]), r"worlds: int64 \[1\]; give bool \[2\], one for each world"),
+        (np.ones(3, bool), r"worlds: bool \[3\]; give bool \[2\]"),
+        ("all", r"worlds: .* \[\]; give bool \[2\]"),
+    ],
+)
+def test_a_reset_takes_only_a_mask_of_worlds(given: Any, words: str) -> None:
+    env = ReachEnv(2)
+    with pytest.raises(ValueError, match=words):
+        env.worlds.reset(given)
+
+
+def test_actions_are_limited_and_one_that_is_not_finite_is_a_fault() -> None:
+    """An action of 5 moves, costs and observes as one of 1. A NaN ends the episode of its world with -10, and moves
+    nothing; the other world goes on as without it, to the bit."""
+    wild, tame = ReachEnv(2), ReachEnv(2)
+    wild.reset(seed=1)
+    tame.reset(seed=1)
+    action = np.full((2, 7), 5.0, np.float32)
+    for one, other in zip(wild.step(action)[:4], tame.step(np.ones((2, 7), np.float32))[:4], strict=True):
+        np.testing.assert_array_equal(one, other)
+    action[0, 3] = np.nan
+    seen, reward, terminated, _, info = wild.step(action)
+    usual, paid, *_ = tame.step(np.ones((2, 7), np.float32))
+    assert terminated.tolist() == [True, False]
+    assert info["fault"].tolist() == [1, 0]
+    assert reward[0] == -10.0
+    np.testing.assert_array_equal(seen[1], usual[1])
+    assert reward[1] == paid[1]
+
+
+def test_wrong_arguments_are_one_clear_line() -> None:
+    env = ReachEnv(2)
+    env.reset(seed=1)
+    for actions, words in ((np.zeros(14), r"shape \(14,\): give \(2, 7\)"), (np.zeros((7, 2)), r"give \(2, 7\)")):
+        with pytest.raises(ValueError, match=words):
+            env.step(actions)
+    for options, words in (
+        ({"num_envs": 0}, "num_envs 0: give a whole number, at least 1"),
+        ({"vines": 0}, "vines 0"),
+        ({"max_episode_steps": "x"}, "max_episode_steps 'x'"),
+        ({"device": "tpu"}, "device 'tpu': give cpu, cuda or cuda:N"),
+        ({"picture_size": 64.5}, "picture_size 64.5: give 8 to 256 px"),
+        ({"observation": "sound"}, "observation 'sound': give state or pictures"),
+        ({"render_mode": "human"}, "render_mode 'human': give rgb_array, or None"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            ReachEnv(**options)

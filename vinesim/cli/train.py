@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import pathlib
 import sys
 import time
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
+from vinesim.cli.signals import Interrupts
 from vinesim.core.errors import UsageError, writing
 from vinesim.core.progress import ProgressLine
 
@@ -57,8 +60,9 @@ def run_training(
     saved = time.monotonic()
     interrupted = False
     try:
-        with ProgressLine() as line:
+        with Interrupts() as interrupts, ProgressLine() as line:
             for done in training.iterations(iterations):
+                interrupts.check()
                 line.show(_progress(done, iterations, limit))
                 if time.monotonic() - saved > SAVE_PERIOD:
                     training.save(out)
@@ -77,7 +81,10 @@ def run_training(
     print(f"policy   {out / 'policy.npz'}", flush=True)
     if interrupted:
         return 130
-    result = evaluate(training.policy(), EVALUATION_WORLDS, seed=seed, device=device, variation=ranges)
+    with _reporting() as report:
+        result = evaluate(
+            training.policy(), EVALUATION_WORLDS, seed=seed, device=device, variation=ranges, report=report
+        )
     training.save(out, {"unseen_vines": result.fields()})
     print(f"unseen   {result.line()}")
     return 0
@@ -108,12 +115,27 @@ def run_evaluation(
     ranges = variation or Variation()
     if full and device != "cpu":
         raise UsageError(f"--full-physics with --device {device}: it runs on the cpu; leave --device out")
-    if full:
-        result = evaluate_with_full_physics(policy, worlds or FULL_PHYSICS_WORLDS, seed=seed, variation=ranges)
-    else:
-        result = evaluate(policy, worlds or EVALUATION_WORLDS, seed=seed, device=device, variation=ranges)
+    with _reporting() as report:
+        if full:
+            count = worlds or FULL_PHYSICS_WORLDS
+            result = evaluate_with_full_physics(policy, count, seed=seed, variation=ranges, report=report)
+        else:
+            count = worlds or EVALUATION_WORLDS
+            result = evaluate(policy, count, seed=seed, device=device, variation=ranges, report=report)
     print(result.line())
     return 0
+
+
+@contextlib.contextmanager
+def _reporting() -> Iterator[Callable[[str], None]]:
+    """Context of an evaluation, whose value shows its progress. Ctrl-C ends the evaluation."""
+    with Interrupts() as interrupts, ProgressLine() as line:
+
+        def report(text: str) -> None:
+            interrupts.check()
+            line.show(text)
+
+        yield report
 
 
 def _check(task: str, device: str) -> None:

@@ -49,7 +49,8 @@ class ArmEnv(TaskEnv):
             describes ``info`` and errors.
         vines_seed: seed of the differences between worlds; the differences stay the same after a reset.
         vines: number of different groups of plants; further worlds repeat them.
-        variation: ranges of these numbers, or a TOML file with them.
+        variation: ranges from which the numbers of each world are drawn: a
+            :class:`~vinesim.learn.variation.Variation`, or the path of its TOML file.
         max_episode_steps: number of actions after which an episode is truncated; None: that of the task.
         on_way: share of the episodes that begin with the arm at a place, drawn evenly, of the way from its first
             positions to those near which the task can be done (:meth:`ArmTask.goals`), for trainings.
@@ -79,9 +80,17 @@ class ArmEnv(TaskEnv):
         observation: str = "state",
         picture_size: int = PICTURE_SIZE,
     ) -> None:
-        check_options(num_envs, arrays, render_mode, observation, picture_size)
-        ranges = as_variation(variation)
         task = self.task_class
+        steps = task.max_steps if max_episode_steps is None else max_episode_steps
+        check_options(
+            {"num_envs": num_envs, "vines": vines, "max_episode_steps": steps},
+            device=device,
+            arrays=arrays,
+            render_mode=render_mode,
+            observation=observation,
+            picture_size=picture_size,
+        )
+        ranges = as_variation(variation)
         variants = [
             task.plants(np.random.default_rng([vines_seed, number]), ranges) for number in range(min(num_envs, vines))
         ]
@@ -105,7 +114,7 @@ class ArmEnv(TaskEnv):
             arrays=arrays,
             variation=ranges,
             rng=np.random.default_rng([vines_seed, vines]),
-            max_episode_steps=task.max_steps if max_episode_steps is None else max_episode_steps,
+            max_episode_steps=steps,
             render_mode=render_mode,
             observation=observation,
             cameras=CAMERAS,

@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import pathlib
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import warp as wp
 from gymnasium.utils.seeding import np_random
 
+from vinesim.core.errors import UsageError
 from vinesim.kernels.learn.episodes import draw_targets
 from vinesim.learn import TASKS
 from vinesim.learn.arm_env import ArmEnv
@@ -22,7 +24,15 @@ from vinesim.scene.model import Model
 from vinesim.world import Physics
 
 UNSEEN = 2**31
-"""Seed of vines from which on they are for evaluations. Those of trainings have smaller seeds."""
+"""Smallest seed of vines for evaluations. Trainings use smaller seeds."""
+
+
+Report = Callable[[str], object]
+"""Function that is called with a line of text about the progress. An exception that it raises ends the evaluation."""
+
+
+def _no_report(_: str) -> None:
+    """Report nothing."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,11 +71,12 @@ def evaluate(
     seed: int = 1,
     device: str = "cpu",
     variation: Variation | str | pathlib.Path = Variation(),
+    report: Report = _no_report,
 ) -> Evaluation:
     """Returns how a policy does in one episode in each of ``worlds``, all with different vines.
 
-    ``seed``: seed of vines and of wanted bunches. Raises :class:`~vinesim.learn.policy.PolicyError` for a policy of an
-    unknown task or with other numbers than its task has.
+    ``seed``: seed of vines and of wanted bunches. ``report``: see :data:`Report`. Raises
+    :class:`~vinesim.learn.policy.PolicyError` for a policy of an unknown task or with other numbers than its task has.
     """
     task = task_of(policy)
     policy.check_numbers(task.numbers, task.actions)
@@ -77,6 +88,7 @@ def evaluate(
     success = np.zeros(worlds, bool)
     faults = actions = 0
     for k in range(env.max_episode_steps):
+        report(f"action {k + 1} of {env.max_episode_steps}, {int(success.sum())} of {worlds} {TASKS[policy.task]}")
         observation, _, terminated, truncated, info = env.step(policy(observation))
         new = going & info["success"]
         success |= new
@@ -91,22 +103,31 @@ def evaluate(
 
 
 def evaluate_with_full_physics(
-    policy: Policy, worlds: int = 100, *, seed: int = 1, variation: Variation | str | pathlib.Path = Variation()
+    policy: Policy,
+    worlds: int = 100,
+    *,
+    seed: int = 1,
+    variation: Variation | str | pathlib.Path = Variation(),
+    report: Report = _no_report,
 ) -> Evaluation:
     """Returns how a policy does with the physics of a client, one world after the other.
 
     Vines and wanted bunches are those of the first ``worlds`` worlds of :func:`evaluate` with the same ``seed``. Here
-    plants touch each other, break and sleep. A fault is a robot or a tree that was stopped. Raises
+    plants touch each other, break and sleep. A fault is a robot or a tree that was stopped. ``report``: see
+    :data:`Report`. Raises
     :class:`~vinesim.learn.policy.PolicyError` as :func:`evaluate` does, and :class:`ValueError` for a variation of
     friction or delay, which only batches have.
     """
     ranges = as_variation(variation)
     task = task_of(policy)
     if ranges.friction != (1.0, 1.0) or ranges.delay != (0, 0):
-        raise ValueError("full physics with a variation of friction or delay: only batches have it; leave both out")
+        raise UsageError("full physics with a variation of friction or delay: only batches have it; leave both out")
     policy.check_numbers(task.numbers, task.actions)
+    if worlds < 1:
+        raise UsageError(f"worlds {worlds}: give at least 1")
     successes = faults = actions = 0
     for number, wanted in enumerate(wanted_bunches(task, worlds, seed)):
+        report(f"world {number + 1} of {worlds}, {successes} {TASKS[policy.task]}")
         physics = task_physics(task, unseen_plants(task, number, seed, ranges))
         pilot = Pilot(physics, policy, task, int(wanted))
         for targets in pilot.targets():
@@ -131,7 +152,8 @@ def task_of(policy: Policy) -> type[ArmTask]:
 def task_physics(task: type[ArmTask], plants: Model, **options: Any) -> Physics:
     """Returns a client's physics with the robot of a task. ``options``: arguments of
     :class:`~vinesim.world.Physics`."""
-    physics = Physics(plants, **({"parameters": task.parameters} | options))
+    options.setdefault("parameters", task.parameters)
+    physics = Physics(plants, **options)
     physics.add_robot(task.robot())
     blade = task.blade()
     if blade is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vinesim.core import frames
+from vinesim.core.errors import UsageError
 from vinesim.learn.variation import Variation
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
@@ -29,7 +30,7 @@ PUSH = 0.02
 SETTLING = 3.0
 """[s] Time in which a shoot that tips over goes away."""
 DRIFT = 0.02
-"""[m] Distance that only bunches of shoots that tip over cover in this time."""
+"""[m] A shoot tips over if its bunch moves farther than this within :data:`SETTLING`."""
 
 
 def shoots(count: int, rng: np.random.Generator, distance: float, variation: Variation = Variation()) -> Model:
@@ -46,7 +47,7 @@ def shoots(count: int, rng: np.random.Generator, distance: float, variation: Var
             return assemble(trees)
         for i in falls:
             trees[i] = _shoot(rng, distance, float(side[i]), variation)
-    raise ValueError(f"shoots tip over under their bunches in {DRAWS} draws: give a higher modulus or lighter bunches")
+    raise UsageError(f"shoots tip over under their bunches in {DRAWS} draws: give a higher modulus or lighter bunches")
 
 
 def _falls(model: Model) -> np.ndarray:

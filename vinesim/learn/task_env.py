@@ -17,9 +17,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from vinesim.kernels.graph import KernelGraph, KernelLaunch
-from vinesim.kernels.learn.episodes import delay_actions, end_episodes, forget_actions
+from vinesim.kernels.learn.episodes import delay_actions, end_episodes, forget_actions, limit_actions
 from vinesim.learn.task_pictures import ObservedPictures, Pictures, Spectator
 from vinesim.learn.variation import Variation
+from vinesim.plants.device_buffers import find_device
 from vinesim.sensors.camera.world_cameras import WorldCamera
 from vinesim.worlds.errors import MissingExtra
 from vinesim.worlds.worlds import Worlds
@@ -58,7 +59,8 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
     ``info`` of an action has ``success`` bool [world], ``fault`` int32 [world] (see
     :attr:`vinesim.worlds.worlds.Worlds.faults`), and if worlds ended also ``final_obs`` [world, k], their last
     observations, with ``_final_obs`` bool [world], which worlds ended. These worlds begin again in the same step. A
-    world with a fault is terminated with reward -10.
+    world with a fault is terminated with reward -10. Actions count as limited to -1 to 1; one that is not finite is a
+    fault.
 
     With arrays on the device, nothing is copied to the host. Results of an action are overwritten by the action after
     the next one, and ``final_obs`` is always present.
@@ -85,8 +87,7 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         picture_size: width and height of observed pictures [px], 8 to 256.
         spectator: camera of :meth:`render`.
 
-    Raises :class:`ValueError` for an unknown library, observation or render mode, or a size that is none,
-    :class:`~vinesim.worlds.errors.MissingExtra` if PyTorch is wanted and not installed.
+    Subclasses call :func:`check_options` before they make the worlds.
     """
 
     metadata: ClassVar[dict[str, Any]] = {
@@ -112,7 +113,6 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         picture_size: int,
         spectator: WorldCamera,
     ) -> None:
-        check_options(worlds.count, arrays, render_mode, observation, picture_size)
         self.worlds = worlds
         self.num_envs = worlds.count
         self.render_mode = render_mode
@@ -146,7 +146,9 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         each = {"threads": self.num_envs, "width": actions}
         delay = KernelLaunch(delay_actions, [self._delay, self._given_action], [self._history, self._action], **each)
         forget = KernelLaunch(forget_actions, [self._begins], [self._history], **each)
-        self._move = self._graph([delay, *self._moves()])
+        limited = [self._given_action, worlds.faults, worlds.fault_count]
+        limit = KernelLaunch(limit_actions, [], limited, threads=self.num_envs)
+        self._move = self._graph([limit, delay, *self._moves()])
         self._begin = self._graph([forget, *self._beginnings()])
         self._results = [self._results_of(numbers) for _ in range(2)]
         self._judge = [self._graph(self._judgements(results)) for results in self._results]
@@ -268,12 +270,16 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
 
     def _take(self, actions: Any) -> None:
         if self.arrays == "numpy":
-            self._given_action.assign(np.asarray(actions, np.float32).reshape(self._action.shape))
-            return
-        given = actions if self.arrays == "warp" else wp.from_torch(actions.detach().contiguous(), dtype=wp.float32)
+            given: Any = np.asarray(actions, np.float32)
+        elif self.arrays == "warp":
+            given = actions
+            if not isinstance(given, wp.array):
+                raise ValueError(f"actions of type {type(given).__name__}: give an array of Warp, or arrays='numpy'")
+        else:
+            given = wp.from_torch(actions.detach().contiguous(), dtype=wp.float32)
         if given.shape != self._action.shape:
-            raise ValueError(f"actions of shape {given.shape}: give {self._action.shape}")
-        wp.copy(self._given_action, given)
+            raise ValueError(f"actions of shape {given.shape}: give {self._action.shape}, one row for each world")
+        self._given_action.assign(given)
 
     def _observed(self, state: wp.array, pictures: Pictures) -> Any:
         """Returns an observation in arrays of the wanted library."""
@@ -295,16 +301,24 @@ def of_world(observation: Any, world: Any) -> Any:
     return observation[world]
 
 
-def check_options(num_envs: int, arrays: str, render_mode: str | None, observation: str, picture_size: int) -> None:
-    """Check what can be wrong with an environment's arguments, before the worlds are made; see :class:`TaskEnv`."""
-    if num_envs < 1:
-        raise ValueError(f"num_envs {num_envs}: give at least 1")
+def check_options(
+    numbers: dict[str, int], *, device: str, arrays: str, render_mode: str | None, observation: str, picture_size: int
+) -> None:
+    """Check what can be wrong with an environment's arguments, before the worlds are made; see :class:`TaskEnv`.
+
+    ``numbers``: arguments that must be whole numbers, at least 1, by name. Raises :class:`ValueError`;
+    :class:`~vinesim.worlds.errors.MissingExtra` if PyTorch is wanted and not installed.
+    """
+    for name, value in numbers.items():
+        if not isinstance(value, int | np.integer) or value < 1:
+            raise ValueError(f"{name} {value!r}: give a whole number, at least 1")
+    find_device(device)
     if render_mode is not None and render_mode not in RENDER_MODES:
         raise ValueError(f"render_mode {render_mode!r}: give {' or '.join(RENDER_MODES)}, or None")
     if observation not in OBSERVATIONS:
         raise ValueError(f"observation {observation!r}: give {' or '.join(OBSERVATIONS)}")
-    if not SMALLEST <= picture_size <= LARGEST:
-        raise ValueError(f"picture_size {picture_size}: give {SMALLEST} to {LARGEST} px")
+    if not isinstance(picture_size, int | np.integer) or not SMALLEST <= picture_size <= LARGEST:
+        raise ValueError(f"picture_size {picture_size!r}: give {SMALLEST} to {LARGEST} px")
     if arrays not in ARRAYS:
         raise ValueError(f"arrays {arrays!r}: give one of {', '.join(ARRAYS)}")
     if arrays == "torch":

@@ -5,6 +5,7 @@ Each number is drawn evenly between the two ends of its range. A world keeps its
 
 from __future__ import annotations
 
+import math
 import pathlib
 
 import msgspec
@@ -44,6 +45,10 @@ class Variation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     def __post_init__(self) -> None:
         for name in self.__struct_fields__:
             low, high = getattr(self, name)
+            if not (math.isfinite(low) and math.isfinite(high)):
+                raise ValueError(f"{name} from {low} to {high}: give finite numbers")
+            if name == "delay" and (low, high) != (int(low), int(high)):
+                raise ValueError(f"delay from {low} to {high}: give whole numbers of actions")
             if low > high:
                 raise ValueError(f"{name} from {low} to {high}: give the lower end first")
             if name != "delay" and low <= 0.0:

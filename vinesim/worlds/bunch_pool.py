@@ -280,6 +280,12 @@ def _check(blade: Blade, bodies: RigidBatch) -> None:
     if np.isfinite(blade.speed) or blade.kind == "saw":
         raise ValueError(f"a {blade.kind} blade with {blade.speed:g} m/s: a batch has blades that close at once")
     bodies.rigid.link_pose(blade.actor, blade.link)  # raises an error if there is no such link
+    frames.checked_pose("pose of the blade", blade.pose)
+    half = np.asarray(blade.half, float)
+    if not (np.isfinite(half) & (half > 0.0)).all():
+        raise ValueError(f"half {half.tolist()} of the blade: give finite numbers above 0 [m]")
+    if not blade.limit > 0.0:
+        raise ValueError(f"force {blade.limit} of the blade: give a number above 0 [N]")
 
 
 def parking_pose(slot: int) -> np.ndarray:

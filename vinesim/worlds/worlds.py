@@ -49,12 +49,26 @@ def _as_table(rows: wp.array) -> wp.array:
     return wp.array(ptr=rows.ptr, shape=(len(rows), width), dtype=float, device=rows.device)
 
 
+def write_mask(worlds: np.ndarray | wp.array | None, mask: wp.array) -> None:
+    """Write into ``mask`` bool [world] which worlds are meant; None: all. Raises :class:`ValueError` for an array of
+    another type or length, such as the numbers of worlds."""
+    if worlds is None:
+        mask.fill_(True)
+        return
+    if not isinstance(worlds, wp.array):
+        worlds = np.asarray(worlds)
+    if tuple(worlds.shape) != mask.shape or worlds.dtype not in (np.bool_, wp.bool):
+        given = getattr(worlds.dtype, "__name__", worlds.dtype)
+        raise ValueError(f"worlds: {given} {list(worlds.shape)}; give bool [{len(mask)}], one for each world")
+    mask.assign(worlds)
+
+
 class Worlds:
     """``count`` worlds with the same robots and boxes, and with plants of their own.
 
     Args:
         model: plants of all worlds, and what stands still. Tree t of world w has the number ``t * count + w``. All
-            worlds are at the same place.
+            worlds use the same coordinates. They overlap, but do not touch each other.
         count: number of worlds.
         robots: robots that each world has, at the poses of their descriptions.
         parameters: numbers of the physics. Nothing sleeps in a batch.
@@ -164,12 +178,10 @@ class Worlds:
     def reset(self, worlds: np.ndarray | wp.array | None = None) -> None:
         """Return worlds to their first states, with the targets that their robots had then.
 
-        ``worlds``: bool [world], whether each world is reset; None: all are. Between two calls of :meth:`step`.
+        ``worlds``: bool [world], whether each world is reset; None: all are. Between two calls of :meth:`step`. Raises
+        :class:`ValueError` for an array of another type or length.
         """
-        if worlds is None:
-            self._resets.fill_(True)
-        else:
-            self._resets.assign(worlds)
+        write_mask(worlds, self._resets)
         self._reset()
 
     @property
@@ -188,7 +200,9 @@ class Worlds:
         return self.contacts.dropped
 
     def step(self, steps: int = 1) -> None:
-        """Advance all worlds by ``steps`` steps."""
+        """Advance all worlds by ``steps`` steps. Raises :class:`ValueError` for less than 0."""
+        if steps < 0:
+            raise ValueError(f"steps {steps}: give 0 or more")
         beside = Beside(self._predict_bodies, self.bodies.integrate)
         if self.pool is not None and self.pool.end_step is not None:
             beside = beside._replace(end=self.pool.end_step)

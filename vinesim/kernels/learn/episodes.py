@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from vinesim.kernels.worlds.reset import MOTION
+
 wp.set_module_options({"enable_backward": False})
 
 FAULT_REWARD = wp.constant(-10.0)
@@ -10,6 +12,30 @@ FAULT_REWARD = wp.constant(-10.0)
 FAILURE_REWARD = wp.constant(-2.0)
 """Added to the reward of an action after which success is no longer possible. GUESSED: the end of an episode, which
 spares its further costs, is no gain then."""
+
+
+@wp.kernel
+def limit_actions(
+    # out
+    action_out: wp.array2d(dtype=float),
+    faults_out: wp.array(dtype=wp.int32),
+    fault_count_out: wp.array(dtype=wp.int32),
+):
+    """One thread per world. Limit the components of its action to -1 to 1. An action that is not finite does nothing, and
+    is a fault of the world's motion."""
+    world = wp.tid()
+    is_finite = bool(True)
+    for k in range(action_out.shape[1]):
+        is_finite = is_finite and wp.isfinite(action_out[world, k])
+    for k in range(action_out.shape[1]):
+        value = float(0.0)
+        if is_finite:
+            value = wp.clamp(action_out[world, k], -1.0, 1.0)
+        action_out[world, k] = value
+    if not is_finite:
+        if faults_out[world] == 0:
+            fault_count_out[world] = fault_count_out[world] + 1
+        faults_out[world] = faults_out[world] | MOTION
 
 
 @wp.kernel

@@ -35,7 +35,7 @@ from vinesim.sensors.raster.camera_rasterizer import MAX_DEPTH
 from vinesim.sensors.raster.primitive_arrays import CONE
 from vinesim.worlds.bunch_pool import shapes_of_bunches
 from vinesim.worlds.plants import gathered, items_of_trees
-from vinesim.worlds.worlds import Worlds
+from vinesim.worlds.worlds import Worlds, write_mask
 
 LARGEST = 1024
 """[px] Largest width and height of a picture."""
@@ -91,6 +91,10 @@ class WorldCameras:
             raise ValueError("no cameras: give at least one")
         if not (1 <= width <= LARGEST and 1 <= height <= LARGEST):
             raise ValueError(f"pictures of {width} x {height} px: give 1 to {LARGEST} px")
+        if not np.isfinite(sun).all() or not np.linalg.norm(sun) > 0.0:
+            raise ValueError(f"sun {sun}: give a vector towards the sun")
+        if not (np.isfinite(grass) and grass >= 0.0):
+            raise ValueError(f"grass {grass}: give 0 or more tufts per square metre")
         self.worlds = worlds
         self._device = worlds.bodies.device
         self._views = self._views_of(cameras, width, height)
@@ -113,13 +117,11 @@ class WorldCameras:
     def render(self, worlds: np.ndarray | wp.array | None = None) -> None:
         """Write the pictures of the present states. Call it between two steps; the states do not change.
 
-        ``worlds``: bool [world], whose pictures are wanted, the others stay; None: all are. A world with a fault of its
-        motion (:attr:`Worlds.faults`) keeps its pictures, because its numbers may not be finite.
+        ``worlds``: bool [world], which worlds to draw. The other worlds keep their pictures. None draws all. A world
+        with a fault of its motion (:attr:`Worlds.faults`) keeps its pictures, because its numbers may not be finite.
+        Raises :class:`ValueError` for an array of another type or length.
         """
-        if worlds is None:
-            self._due.fill_(True)
-        else:
-            self._due.assign(worlds)
+        write_mask(worlds, self._due)
         self.worlds.bodies.update_kinematics()
         self._graph()
 
@@ -145,6 +147,8 @@ class WorldCameras:
         bodies, poses, focal = [], [], []
         for number, camera in enumerate(cameras):
             name = f"pose of camera {number}"
+            if camera.actor is None and camera.link:
+                raise ValueError(f"camera {number} is on link {camera.link!r} of no actor: give the actor too")
             if not 0.01 <= camera.field_of_view <= 3.1:
                 raise ValueError(f"camera {number} has the field_of_view {camera.field_of_view}: give 0.01 to 3.1 rad")
             if camera.actor is not None:
