@@ -296,6 +296,8 @@ def test_canes_that_are_cut_look_as_in_a_client(pitch: int, monkeypatch: pytest.
     middle = np.array([0.0, 0.0, 1.03])
     camera = WorldCamera(pose=look_at(middle + np.array([0.3, -0.4, 0.0]), middle), field_of_view=0.8)
     cameras = WorldCameras(worlds, [camera], SIZE)
+    paint = np.random.default_rng(0).uniform(0.1, 0.9, (cameras.primitives, 3)).astype(np.float32)
+    cameras._tables.looks.tint.assign(np.tile(paint, (2, 1)))  # so that stumps without the colour of the cane are seen
     cameras.render()
     assert cameras.rgb is not None
     first = [array.numpy().copy() for array in (cameras.labels, cameras.depth, cameras.rgb)]
