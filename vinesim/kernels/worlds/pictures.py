@@ -208,17 +208,20 @@ def tree_of(variants: Variants, motion: Motion, world: int, k: int) -> int:
 
 @wp.func
 def body_of(variants: Variants, motion: Motion, world: int, k: int) -> int:
-    """Returns the plant's body that carries primitive ``k`` of the variants in a world."""
-    body = motion.tree_first[tree_of(variants, motion, world, k)] + variants.body[k] * motion.pitch
-    if variants.role[k] == GROWN:
-        segment = body
-        place = variants.place[k]
-        if place < motion.canes.start[segment]:  # it stays on a stump
-            for i in range(motion.spares):
-                spare = motion.first_spare[tree_of(variants, motion, world, k)] + i * motion.pitch
-                is_here = motion.canes.start[spare] <= place and place < motion.canes.end[spare]
-                if motion.canes.segment[spare] == segment and is_here:
-                    body = spare
+    """Returns the plant's body in whose frame primitive ``k`` of the variants is, in a world."""
+    return motion.tree_first[tree_of(variants, motion, world, k)] + variants.body[k] * motion.pitch
+
+
+@wp.func
+def part_at(motion: Motion, tree: int, segment: int, place: float) -> int:
+    """Returns the part of a segment of a cane on which something grows, ``place`` [m] from the segment's origin."""
+    body = int(segment)
+    if place < motion.canes.start[segment]:  # it stays on a stump
+        for i in range(motion.spares):
+            spare = motion.first_spare[tree] + i * motion.pitch
+            is_here = motion.canes.start[spare] <= place and place < motion.canes.end[spare]
+            if motion.canes.segment[spare] == segment and is_here:
+                body = spare
     return body
 
 
@@ -230,8 +233,7 @@ def wood_of_stump(variants: Variants, motion: Motion, world: int, k: int) -> int
     if segment >= 0:
         number = (segment - motion.tree_first[tree_of(variants, motion, world, k)]) // motion.pitch
         wood = variants.wood[variants.first_wood[k] + number]
-        if wood >= 0:
-            found = variants.first_primitive[variants.of_world[world]] + wood
+        found = variants.first_primitive[variants.of_world[world]] + wood
     return found
 
 
@@ -248,7 +250,10 @@ def carrier_pose(variants: Variants, motion: Motion, world: int, k: int, slot: i
     elif (role == BUNCH or role == PIECE) and slot >= 0:
         pose = wp.transform_multiply(rigid_pose(motion, world, motion.pool_body[slot]), pose)
     elif role != STATIC:
-        pose = motion.body_q[body_of(variants, motion, world, k)]
+        body = body_of(variants, motion, world, k)
+        if role == GROWN:
+            body = part_at(motion, tree_of(variants, motion, world, k), body, variants.place[k])
+        pose = motion.body_q[body]
     return pose
 
 
@@ -372,10 +377,9 @@ def pose_primitives(
                 s = pose_solid(local, whole, kind, pose)
             if role == STALK or role == PIECE:
                 s = cut_stalk(s, motion, world, role, variants.above[k], slot)
-            elif role == WOOD:
+            elif (role == WOOD or role == STUMP) and whole >= 0:
                 s = cut_cane(s, motion.canes, body_of(variants, motion, world, k))
-            elif role == STUMP and whole >= 0:
-                s = cut_cane(s, motion.canes, body_of(variants, motion, world, k))
+            if whole >= 0 and whole != k:
                 like = i + whole - k
                 looks_out.material[i] = looks_out.material[like]
                 looks_out.tint[i] = looks_out.tint[like]
