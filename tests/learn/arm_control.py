@@ -1,76 +1,113 @@
-"""A controller of the arm of the learning tasks that knows its kinematics."""
+"""Controllers of the arm of the learning tasks that know its kinematics."""
 
+import functools
 from typing import Any
 
-import mujoco
 import numpy as np
 
-from vinesim.learn.arm import TOOL, TOOL_LINK, arm
-from vinesim.learn.arm_env import BASE, HOME
-from vinesim.learn.reach import NUMBERS, plants
+from vinesim.learn.arm_kinematics import ArmKinematics
+from vinesim.learn.arm_task import ArmTask
+from vinesim.learn.pick import Pick
+from vinesim.learn.prune import Prune
+from vinesim.learn.reach import Reach
 from vinesim.learn.variation import Variation
-from vinesim.rigid.rigid_world import RigidWorld
 
-LEVER = 0.3
-"""[m] Weight of turning: a turn counts as the way of a point at this distance."""
-
-
-def turn_upright(axes: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-    """Returns the rotation vector [3] rad from ``axes`` [3, 3] to axes with x along ``ahead`` [3] and z upwards."""
-    up = np.array([0.0, 0.0, 1.0])
-    wanted = np.stack([ahead, np.cross(up, ahead), up], 1)
-    turn = wanted @ axes.T
-    angle = np.arccos(np.clip(0.5 * (np.trace(turn) - 1.0), -1.0, 1.0))
-    across = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    return angle * across / max(float(np.linalg.norm(across)), 1e-9)
+GAIN = 8.0
+"""Action per rad that a joint is to turn."""
+OPEN = 0.03
+"""[m] Opening of the fingers with which the hand comes to a stalk."""
+BELOW = 0.012
+"""[m] How far below the middle of a stalk the hand grasps it, so that the cane above is not in the blade's mouth."""
+CLOSED_ON_STALK = -0.04
+"""[m] Opening of the fingers below which they have closed: a stalk of 4 mm leaves -0.044 m."""
 
 
-def towards(env: Any, ways: np.ndarray, gain: float = 8.0, ahead: np.ndarray | None = None) -> np.ndarray:
-    """Returns the actions [world, 7] that move the point between the fingers along ``ways`` [world, 3] m, by the damped
-    pseudo-inverse of its Jacobian. ``ahead`` [world, 3]: horizontal directions into which the upright hand turns; None:
-    it turns as it likes."""
+@functools.cache
+def kinematics(task: type[ArmTask]) -> ArmKinematics:
+    """Returns the kinematics of a task's arm."""
+    return ArmKinematics(task.plants(np.random.default_rng(0), Variation()), task.robot())
+
+
+def towards(env: Any, ways: np.ndarray, gain: float = GAIN, ahead: np.ndarray | None = None) -> np.ndarray:
+    """Returns the actions [world, 7] that move the point between the fingers along ``ways`` [world, 3] m. ``ahead``
+    [world, 3]: horizontal directions into which the upright hand turns; None: it turns as it likes."""
+    arm = kinematics(env.unwrapped.task_class)
     bodies = env.unwrapped.worlds.bodies
+    positions = bodies.data.qpos.numpy()[:, bodies.rigid.robot("arm").q[:7]]
     turns = [None] * len(ways) if ahead is None else ahead
-    actions = [
-        _action(bodies.rigid, qpos, way, gain, turn)
-        for qpos, way, turn in zip(bodies.data.qpos.numpy(), ways, turns, strict=True)
-    ]
-    return np.array(actions, np.float32)
+    steps = [arm.step(*each) for each in zip(positions, ways, turns, strict=True)]
+    return np.clip(gain * np.array(steps), -1.0, 1.0).astype(np.float32)
 
 
-class Reaching:
-    """A stand-in for a policy of the task reach that moves straight to the wanted bunch."""
+class Controller:
+    """A stand-in for a policy of a task that computes actions from observations and the kinematics of the arm."""
 
-    task = "reach"
-
-    def __init__(self) -> None:
-        self._rigid = RigidWorld(plants(np.random.default_rng(0), Variation()))
-        self._rigid.add_robot(arm(BASE, HOME))
+    def __init__(self, task: type[ArmTask]) -> None:
+        self.task = task.name
+        self._numbers = (task.numbers, task.actions)
+        self._arm = kinematics(task)
 
     def check_numbers(self, inputs: int, outputs: int) -> None:
-        assert (inputs, outputs) == (NUMBERS, 7)
+        assert (inputs, outputs) == self._numbers
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         if observation.ndim == 2:
             return np.array([self(one) for one in observation])
-        qpos = self._rigid.mj_data.qpos.copy()
-        qpos[self._rigid.robot("arm").q[:7]] = observation[:7]
-        return _action(self._rigid, qpos, observation[14:17], 8.0).astype(np.float32)
+        return np.clip(self._act(observation.astype(float)), -1.0, 1.0).astype(np.float32)
+
+    def _act(self, observation: np.ndarray) -> np.ndarray:
+        raise NotImplementedError
 
 
-def _action(rigid: Any, qpos: np.ndarray, way: np.ndarray, gain: float, ahead: np.ndarray | None = None) -> np.ndarray:
-    robot = rigid.robot("arm")
-    m = rigid.mj_model
-    d = mujoco.MjData(m)
-    body = robot.bodies[TOOL_LINK]
-    d.qpos[:] = qpos
-    mujoco.mj_kinematics(m, d)
-    mujoco.mj_comPos(m, d)
-    axes = d.xmat[body].reshape(3, 3)
-    jacobian = np.zeros((6, m.nv))
-    mujoco.mj_jac(m, d, jacobian[:3], jacobian[3:], d.xpos[body] + axes @ np.array(TOOL), body)
-    J = jacobian[:3, robot.v[:7]]
-    if ahead is not None:
-        J = np.concatenate([J, LEVER * jacobian[3:, robot.v[:7]]])
-        way = np.concatenate([way, LEVER * turn_upright(axes, ahead)])
-    return np.clip(gain * J.T @ np.linalg.solve(J @ J.T + 0.01 * np.eye(len(J)), way), -1.0, 1.0)
+class Reaching(Controller):
+    """Moves straight to the wanted bunch."""
+
+    def __init__(self) -> None:
+        super().__init__(Reach)
+
+    def _act(self, observation: np.ndarray) -> np.ndarray:
+        return GAIN * self._arm.step(observation[:7], observation[14:17])
+
+
+class Picking(Controller):
+    """Comes to 5 cm in front of the stalk, goes on until it is between the fingers, closes them, and commands the blade
+    once they are closed."""
+
+    def __init__(self) -> None:
+        super().__init__(Pick)
+
+    def _act(self, observation: np.ndarray) -> np.ndarray:
+        q = observation[:7]
+        opening = observation[14]
+        to_stalk = observation[15:18]
+        ahead = self._arm.ahead(q, self._arm.point(q) + to_stalk)
+        aside = np.linalg.norm(to_stalk - (to_stalk @ ahead) * ahead)
+        is_in_front = aside < 0.03 and to_stalk @ ahead < 0.09
+        around = to_stalk + 0.01 * ahead - [0.0, 0.0, BELOW]
+        is_around = np.linalg.norm(around) < 0.012
+        is_closing = np.linalg.norm(to_stalk) < 0.035 and opening < 0.02
+        action = np.zeros(9)
+        if not is_around and not is_closing:
+            action[:7] = GAIN * self._arm.step(q, around if is_in_front else to_stalk - 0.05 * ahead, ahead)
+            action[7] = -0.5 if opening < OPEN else 0.0
+        else:
+            action[7] = 1.0
+            action[8] = opening < CLOSED_ON_STALK
+        return action
+
+
+class Pruning(Controller):
+    """Comes to 7 cm in front of the wanted internode, upright, goes on until the cane is between the bars, and cuts."""
+
+    def __init__(self) -> None:
+        super().__init__(Prune)
+
+    def _act(self, observation: np.ndarray) -> np.ndarray:
+        way = observation[14:17]
+        ahead = np.array([1.0, 0.0, 0.0])
+        left = way @ ahead
+        is_in_front = np.linalg.norm(way - left * ahead) < 0.015 or left < 0.04
+        action = np.zeros(8)
+        action[:7] = GAIN * self._arm.step(observation[:7], way if is_in_front else way - 0.07 * ahead, ahead)
+        action[7] = np.linalg.norm(way) < 0.008
+        return action

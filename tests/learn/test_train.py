@@ -42,7 +42,7 @@ def test_options_that_do_not_fit_are_refused_in_one_line(tmp_path: pathlib.Path)
     for task, out, full, message in (
         ("reach", None, False, "give --out FOLDER to train, or --evaluate FILE"),
         ("reach", tmp_path / "run", True, "--full-physics without --evaluate"),
-        ("swim", tmp_path / "run", False, "no task 'swim'; give reach or expose"),
+        ("swim", tmp_path / "run", False, "no task 'swim'; give one of reach, expose, pick"),
     ):
         with pytest.raises(UsageError, match=message):
             run_training(task, out, 4, full=full, **training)
@@ -116,6 +116,21 @@ def test_a_training_writes_its_policy_its_curve_and_a_summary(tmp_path: pathlib.
     assert summary["iterations"] == 4
     assert summary["unseen_vines"] == {"worlds": 1}
     assert "torch" in summary["libraries"]
+
+
+@pytest.mark.gpu
+@pytest.mark.slow
+def test_the_noise_of_a_training_of_pick_falls() -> None:
+    pytest.importorskip("rsl_rl")
+    from vinesim.learn.pick import Pick
+    from vinesim.learn.train import LEAST_NOISE, Training
+
+    training = Training("pick", 2, seed=3)
+    deviations = training._runner.alg.get_policy().distribution.log_std_param
+    np.testing.assert_allclose(deviations.exp().tolist(), Pick.noise, rtol=1e-5)
+    for largest, expected in ((0.3, 0.3), (0.5, 0.3), (0.01, LEAST_NOISE)):
+        training._limit_noise(largest)
+        np.testing.assert_allclose(deviations.exp().tolist(), expected, rtol=1e-5)
 
 
 @pytest.mark.gpu

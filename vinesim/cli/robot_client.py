@@ -39,7 +39,7 @@ def run(options: ClientOptions) -> int:
     validate_task_name(options.job)
     validate_sight(options.job, options.see)
     harvest = HarvestOptions.named(options.bunches, options.order)
-    learned = None if options.policy is None else _learned_reach(options)
+    learned = None if options.policy is None else _learned_task(options)
     if learned is None:
         descriptions = [
             load_description(robot, srdf=options.srdf, xacro_args=options.xacro_args or (), base=options.base)
@@ -119,7 +119,7 @@ class _LearnedTask(NamedTuple):
     begin: Callable[[Physics, Robot], Task]
 
 
-def _learned_reach(options: ClientOptions) -> _LearnedTask:
+def _learned_task(options: ClientOptions) -> _LearnedTask:
     """Load the policy of ``--policy`` and draw its task. Raises :class:`UsageError` for options that do not fit."""
     unfit = {
         "--robot": options.robot,
@@ -133,21 +133,20 @@ def _learned_reach(options: ClientOptions) -> _LearnedTask:
     given = next((flag for flag, value in unfit.items() if value is not None), None)
     if given is not None:
         raise UsageError(f"{given} with --policy {options.policy}: the task has its own robot and plants; leave it out")
-    from vinesim.learn.arm_env import BASE
-    from vinesim.learn.evaluate import unseen_plants, wanted_bunches
-    from vinesim.learn.pilot import ReachBunch, arm_description
+    from vinesim.learn.arm_task import BASE
+    from vinesim.learn.evaluate import task_of, unseen_plants, wanted_bunches
+    from vinesim.learn.pilot import PolicyTask, task_description
     from vinesim.learn.policy import load_policy
 
     policy = load_policy(str(options.policy))
-    if policy.task != "reach":
-        raise UsageError(f"--policy {options.policy} is for {policy.task}; give one of vinesim train reach")
+    task = task_of(policy)
     seed = options.seed or 0
-    (wanted,) = wanted_bunches(1, seed)
+    (wanted,) = wanted_bunches(task, 1, seed)
     return _LearnedTask(
-        unseen_plants(0, seed),
-        arm_description(),
+        unseen_plants(task, 0, seed),
+        task_description(task),
         frames.pose(np.array(BASE)),
-        functools.partial(ReachBunch, policy=policy, wanted=int(wanted)),
+        functools.partial(PolicyTask, policy=policy, task=task, wanted=int(wanted)),
     )
 
 

@@ -106,8 +106,8 @@ def run_evaluation(
     if policy.task != task:
         raise UsageError(f"{file} is a policy for {policy.task}; run: vinesim train {policy.task} --evaluate {file}")
     ranges = variation or Variation()
-    if full and (task != "reach" or device != "cpu"):
-        raise UsageError(f"--full-physics with task {task} and --device {device}: it has reach, on the cpu")
+    if full and device != "cpu":
+        raise UsageError(f"--full-physics with --device {device}: it runs on the cpu; leave --device out")
     if full:
         result = evaluate_with_full_physics(policy, worlds or FULL_PHYSICS_WORLDS, seed=seed, variation=ranges)
     else:
@@ -122,7 +122,7 @@ def _check(task: str, device: str) -> None:
     from vinesim.plants.device_buffers import find_device
 
     if task not in TASKS:
-        raise UsageError(f"no task {task!r}; give {' or '.join(TASKS)}")
+        raise UsageError(f"no task {task!r}; give one of {', '.join(TASKS)}")
     find_device(device)
 
 

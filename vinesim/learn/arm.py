@@ -18,8 +18,12 @@ TOOL_LINK = "link_6"
 """Link that carries the fingers."""
 TOOL = (0.2, 0.0, 0.0)
 """[m] Point between the tips of the fingers, in the axes of :data:`TOOL_LINK`."""
+FINGER = (0.08, 0.012, 0.024)
+"""[m] Edges of a finger: along the hand, across, and along the hand's vertical axis. Its tip is at :data:`TOOL`."""
 FINGER_WAY = 0.03
 """[m] Largest distance of a finger from the middle of its way, where the fingers are 6 cm apart."""
+GAP = 2.0 * FINGER_WAY - FINGER[1]
+"""[m] Clear width between the fingers in the middle of their ways."""
 CLOSED = 0.026
 """[m] Target of a finger that closes, as a distance from the middle of its way. The fingers touch at 24 mm."""
 JOINT_LIMIT = 2.5
@@ -58,7 +62,7 @@ def arm(
         drives.append(Drive(f"joint_{i}", 300.0, 30.0, 200.0, 5.0, -JOINT_LIMIT, JOINT_LIMIT))
         parent = name
     for side, y in (("left", 0.03), ("right", -0.03)):
-        parts.append(_link(side, 0.1, '<box size="0.08 0.012 0.024"/>'))
+        parts.append(_link(side, 0.1, '<box size="{} {} {}"/>'.format(*FINGER)))
         parts.append(_joint(f"{side}_finger", "prismatic", parent, side, f"0.16 {y} 0", "0 1 0", FINGER_WAY))
         drives.append(Drive(f"{side}_finger", *finger_gains, 40.0, 1.0, -FINGER_WAY, FINGER_WAY))
     urdf = f'<robot name="arm">{"".join(parts)}</robot>'

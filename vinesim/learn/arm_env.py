@@ -1,34 +1,27 @@
-"""What the tasks with an arm in front of shoots share: worlds, actions, and what differs between worlds."""
+"""The tasks with the arm as environments: worlds, the differences between them, and episodes."""
 
 from __future__ import annotations
 
 import functools
 import pathlib
-from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
+import warp as wp
 
 from vinesim.core import frames
 from vinesim.kernels.graph import KernelLaunch
-from vinesim.learn.arm import AXES, TOOL_LINK, arm
-from vinesim.learn.arm_arrays import ArmArrays, arrays_of_worlds
+from vinesim.kernels.learn.episodes import begin_on_way, draw_targets
+from vinesim.learn.arm import AXES, TOOL_LINK
+from vinesim.learn.arm_arrays import arrays_of_worlds
+from vinesim.learn.arm_task import HOME, ArmTask
 from vinesim.learn.task_env import TaskEnv, check_options
 from vinesim.learn.variation import Variation, as_variation
-from vinesim.scene.model import Model
-from vinesim.scene.values import RobotSpec
 from vinesim.sensors.camera.world_cameras import WorldCamera
 from vinesim.sensors.export.images import look_at
 from vinesim.worlds.plants import plants_of_worlds
 from vinesim.worlds.worlds import Worlds
 
-DISTANCE = 1.2
-"""[m] From the origin to the row of shoots."""
-BASE = (-0.1, 0.0, 0.6)
-"""[m] Place of the base of the arm."""
-HOME = np.array([0.0, -2.3, 0.0, 1.9, 0.0, 1.6, 0.0, 0.0, 0.0])
-"""First positions of the joints [rad] and fingers [m]."""
-MAX_EPISODE_STEPS = 100
 VARIANTS = 64
 """Default for the number of different groups of plants; further worlds repeat them."""
 PICTURE_SIZE = 64
@@ -43,16 +36,13 @@ CAMERAS = (
 looks along them. GUESSED."""
 SPECTATOR = WorldCamera(pose=look_at(np.array([-0.4, -1.0, 1.25]), np.array([0.55, 0.0, 0.72])), field_of_view=0.8)
 """Camera of ``render``, which sees the arm and the shoots."""
-Plants = Callable[[np.random.Generator, Variation], Model]
 
 
 class ArmEnv(TaskEnv):
-    """A task of an arm of seven joints. Its action [7], from -1 to 1, sets the speeds of the targets of the joints, in
-    units of 1 rad/s.
+    """A task of an arm of seven joints. Its action, from -1 to 1, sets the speeds of the targets of the joints, in
+    units of 1 rad/s; further components are described by the task.
 
     Args:
-        plants: returns the plants of a world.
-        numbers: number of an observation's components.
         num_envs: number of worlds.
         device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
         arrays: ``"numpy"``, ``"torch"`` or ``"warp"``; see :class:`~vinesim.learn.task_env.TaskEnv`, which also
@@ -60,20 +50,22 @@ class ArmEnv(TaskEnv):
         vines_seed: seed of the differences between worlds; the differences stay the same after a reset.
         vines: number of different groups of plants; further worlds repeat them.
         variation: ranges of these numbers, or a TOML file with them.
-        max_episode_steps: number of actions after which an episode is truncated.
-        robot: the robot, whose first drives are the seven joints; None: :func:`~vinesim.learn.arm.arm`.
-        actions: number of an action's components, if the task has more.
+        max_episode_steps: number of actions after which an episode is truncated; None: that of the task.
+        on_way: share of the episodes that begin with the arm at a place, drawn evenly, of the way from its first
+            positions to those near which the task can be done (:meth:`ArmTask.goals`), for trainings.
         render_mode: ``"rgb_array"`` or None; see :meth:`~vinesim.learn.task_env.TaskEnv.render`.
         observation: ``"state"`` or ``"pictures"``: the numbers, or a dictionary of the numbers (``state``) and of
             pictures of :data:`CAMERAS`; see :class:`~vinesim.learn.task_env.TaskEnv`.
         picture_size: width and height of these pictures [px].
-        options: further arguments of :class:`~vinesim.worlds.worlds.Worlds`.
     """
+
+    task_class: ClassVar[type[ArmTask]]
+    """The task."""
+    world_options: ClassVar[dict[str, Any]] = {}
+    """Further arguments of :class:`~vinesim.worlds.worlds.Worlds`."""
 
     def __init__(
         self,
-        plants: Plants,
-        numbers: int,
         num_envs: int = 1,
         *,
         device: str = "cpu",
@@ -81,34 +73,39 @@ class ArmEnv(TaskEnv):
         vines_seed: int = 0,
         vines: int = VARIANTS,
         variation: Variation | str | pathlib.Path = Variation(),
-        max_episode_steps: int = MAX_EPISODE_STEPS,
+        max_episode_steps: int | None = None,
+        on_way: float = 0.0,
         render_mode: str | None = None,
         observation: str = "state",
         picture_size: int = PICTURE_SIZE,
-        robot: RobotSpec | None = None,
-        actions: int = len(AXES),
-        **options: Any,
     ) -> None:
         check_options(num_envs, arrays, render_mode, observation, picture_size)
         ranges = as_variation(variation)
+        task = self.task_class
         variants = [
-            plants(np.random.default_rng([vines_seed, number]), ranges) for number in range(min(num_envs, vines))
+            task.plants(np.random.default_rng([vines_seed, number]), ranges) for number in range(min(num_envs, vines))
         ]
+        self._on_way = on_way
+        goals = [task.goals(model) for model in variants] if on_way > 0.0 else []
+        self._goals = np.array([goals[world % len(variants)] for world in range(num_envs)] if goals else [])
+        worlds = Worlds(
+            plants_of_worlds(variants, num_envs),
+            num_envs,
+            robots=[task.robot()],
+            parameters=task.parameters,
+            device=device,
+            blade=task.blade(),
+            **self.world_options,
+        )
         super().__init__(
-            Worlds(
-                plants_of_worlds(variants, num_envs),
-                num_envs,
-                robots=[arm(BASE, HOME) if robot is None else robot],
-                device=device,
-                **options,
-            ),
-            actions,
-            numbers,
+            worlds,
+            task.actions,
+            task.numbers,
             device=device,
             arrays=arrays,
             variation=ranges,
             rng=np.random.default_rng([vines_seed, vines]),
-            max_episode_steps=max_episode_steps,
+            max_episode_steps=task.max_steps if max_episode_steps is None else max_episode_steps,
             render_mode=render_mode,
             observation=observation,
             cameras=CAMERAS,
@@ -117,9 +114,34 @@ class ArmEnv(TaskEnv):
         )
 
     @functools.cached_property
-    def arm_arrays(self) -> ArmArrays:
-        """What kernels read and write."""
-        return arrays_of_worlds(self.worlds)
+    def task(self) -> ArmTask:
+        """The task in these worlds."""
+        return self.task_class(arrays_of_worlds(self.worlds))
+
+    @property
+    def _failed(self) -> wp.array:
+        return self.task.failed
 
     def _moves(self) -> list[KernelLaunch]:
-        return [self.arm_arrays.move(self._action, self.worlds.dt)]
+        return self.task.moves(self._action, self.worlds.dt)
+
+    def _observations(self, observation: wp.array, reward: wp.array, success: wp.array) -> list[KernelLaunch]:
+        return [self.task.observe(self._given_action, observation, reward, success)]
+
+    def _beginnings(self) -> list[KernelLaunch]:
+        given = [self.task_class.choices, self._seed, self._begins]
+        draw = KernelLaunch(draw_targets, given, [self._episode, self.task.wanted], threads=self.num_envs)
+        return [draw, *self._starts(), *self.task.beginnings(self._begins)]
+
+    def _starts(self) -> list[KernelLaunch]:
+        """Returns the launch that lets some episodes begin on the way to the goals, if any do."""
+        if self._on_way == 0.0:
+            return []
+        arrays = self.task.arrays
+        home = self.on_device(HOME[: len(AXES)], float)
+        given = [self._on_way, home, self.on_device(self._goals, float), arrays.arm.q]
+        given += [self._seed, self._begins, self._episode, self.task.wanted]
+        return [KernelLaunch(begin_on_way, given, [arrays.arm.qpos, arrays.targets], threads=self.num_envs)]
+
+    def _counts(self) -> list[KernelLaunch]:
+        return self.task.counts()

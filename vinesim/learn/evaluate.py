@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import pathlib
-from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -13,12 +13,10 @@ from gymnasium.utils.seeding import np_random
 
 from vinesim.kernels.learn.episodes import draw_targets
 from vinesim.learn import TASKS
-from vinesim.learn.arm import AXES, arm
-from vinesim.learn.arm_env import BASE, HOME, MAX_EPISODE_STEPS, ArmEnv
-from vinesim.learn.pilot import ReachPilot
+from vinesim.learn.arm_env import ArmEnv
+from vinesim.learn.arm_task import ArmTask
+from vinesim.learn.pilot import Pilot
 from vinesim.learn.policy import Policy, PolicyError
-from vinesim.learn.reach import NUMBERS, SHOOTS, plants
-from vinesim.learn.task_env import STEPS
 from vinesim.learn.variation import Variation, as_variation
 from vinesim.scene.model import Model
 from vinesim.world import Physics
@@ -49,7 +47,7 @@ class Evaluation:
         return f"{TASKS[self.task]} {self.successes} of {self.worlds} ({100.0 * self.successes / self.worlds:.1f} %)"
 
 
-def environment(task: str) -> Callable[..., ArmEnv]:
+def environment(task: str) -> type[ArmEnv]:
     """Returns the class of a task of :data:`vinesim.learn.TASKS`. Raises :class:`ValueError` for another name."""
     if task not in TASKS:
         raise ValueError(f"task {task!r}: give one of {', '.join(TASKS)}")
@@ -69,12 +67,11 @@ def evaluate(
     ``seed``: seed of vines and of wanted bunches. Raises :class:`~vinesim.learn.policy.PolicyError` for a policy of an
     unknown task or with other numbers than its task has.
     """
-    if policy.task not in TASKS:
-        raise PolicyError(f"the policy is for task {policy.task!r}, which is none of {', '.join(TASKS)}")
+    task = task_of(policy)
+    policy.check_numbers(task.numbers, task.actions)
     env = environment(policy.task)(
         worlds, device=device, vines_seed=UNSEEN + seed, vines=worlds, variation=variation
     )  # fmt: skip
-    policy.check_numbers(env.num_observations, env.num_actions)
     observation, _ = env.reset(seed=seed)
     going = np.ones(worlds, bool)
     success = np.zeros(worlds, bool)
@@ -96,50 +93,63 @@ def evaluate(
 def evaluate_with_full_physics(
     policy: Policy, worlds: int = 100, *, seed: int = 1, variation: Variation | str | pathlib.Path = Variation()
 ) -> Evaluation:
-    """Returns how a policy for *reach* does with the physics of a client, one world after the other.
+    """Returns how a policy does with the physics of a client, one world after the other.
 
     Vines and wanted bunches are those of the first ``worlds`` worlds of :func:`evaluate` with the same ``seed``. Here
     plants touch each other, break and sleep. A fault is a robot or a tree that was stopped. Raises
-    :class:`~vinesim.learn.policy.PolicyError` as :func:`evaluate` does, and :class:`ValueError` for another task, and
-    for a variation of friction or delay, which only batches have.
+    :class:`~vinesim.learn.policy.PolicyError` as :func:`evaluate` does, and :class:`ValueError` for a variation of
+    friction or delay, which only batches have.
     """
     ranges = as_variation(variation)
-    if policy.task != "reach":
-        raise ValueError(f"full physics with task {policy.task}: there is only reach")
+    task = task_of(policy)
     if ranges.friction != (1.0, 1.0) or ranges.delay != (0, 0):
         raise ValueError("full physics with a variation of friction or delay: only batches have it; leave both out")
-    policy.check_numbers(NUMBERS, len(AXES))
+    policy.check_numbers(task.numbers, task.actions)
     successes = faults = actions = 0
-    for number, wanted in enumerate(wanted_bunches(worlds, seed)):
-        physics = Physics(unseen_plants(number, seed, ranges))
-        physics.add_robot(arm(BASE, HOME))
-        pilot = ReachPilot(physics, policy, int(wanted))
-        for k in range(MAX_EPISODE_STEPS):
-            physics.rigid.command("arm", pilot.act())
-            for _ in range(STEPS):
-                physics.step()
-            pilot.look()
+    for number, wanted in enumerate(wanted_bunches(task, worlds, seed)):
+        physics = task_physics(task, unseen_plants(task, number, seed, ranges))
+        pilot = Pilot(physics, policy, task, int(wanted))
+        for targets in pilot.targets():
+            physics.rigid.command("arm", targets)
+            physics.step()
             if physics.faults["robots_stopped"] or physics.faults["trees_stopped"]:
                 faults += 1
                 break
-            if pilot.has_reached:
-                successes += 1
-                actions += k + 1
-                break
+        else:
+            successes += pilot.succeeded
+            actions += pilot.actions if pilot.succeeded else 0
     return Evaluation(policy.task, worlds, successes, faults, actions / max(successes, 1))
 
 
-def unseen_plants(number: int, seed: int, variation: Variation = Variation()) -> Model:
-    """Returns the shoots of world ``number`` of :func:`evaluate`, for the task reach."""
-    return plants(np.random.default_rng([UNSEEN + seed, number]), variation)
+def task_of(policy: Policy) -> type[ArmTask]:
+    """Returns the task of a policy. Raises :class:`~vinesim.learn.policy.PolicyError` for an unknown one."""
+    if policy.task not in TASKS:
+        raise PolicyError(f"the policy is for task {policy.task!r}, which is none of {', '.join(TASKS)}")
+    return environment(policy.task).task_class
 
 
-def wanted_bunches(worlds: int, seed: int) -> np.ndarray:
-    """Returns the numbers [world] of the bunches that a batch of :class:`~vinesim.learn.reach.ReachEnv` wants in its
-    first episodes after ``reset(seed=seed)``."""
+def task_physics(task: type[ArmTask], plants: Model, **options: Any) -> Physics:
+    """Returns a client's physics with the robot of a task. ``options``: arguments of
+    :class:`~vinesim.world.Physics`."""
+    physics = Physics(plants, **({"parameters": task.parameters} | options))
+    physics.add_robot(task.robot())
+    blade = task.blade()
+    if blade is not None:
+        physics.add_blade(blade.actor, blade.link, blade.pose, blade.half, force=blade.limit, speed=blade.speed)
+    return physics
+
+
+def unseen_plants(task: type[ArmTask], number: int, seed: int, variation: Variation = Variation()) -> Model:
+    """Returns the plants of world ``number`` of :func:`evaluate`."""
+    return task.plants(np.random.default_rng([UNSEEN + seed, number]), variation)
+
+
+def wanted_bunches(task: type[ArmTask], worlds: int, seed: int) -> np.ndarray:
+    """Returns the numbers [world] of the trees whose bunches a batch of the task wants in its first episodes after
+    ``reset(seed=seed)``."""
     rng, _ = np_random(seed)
     begins = wp.full(worlds, True, dtype=wp.bool, device="cpu")
     drawn = wp.array([rng.integers(2**31)], dtype=wp.int32, device="cpu")
     episode, wanted = (wp.zeros(worlds, dtype=wp.int32, device="cpu") for _ in range(2))
-    wp.launch(draw_targets, worlds, [SHOOTS, drawn, begins], [episode, wanted], device="cpu")
+    wp.launch(draw_targets, worlds, [task.choices, drawn, begins], [episode, wanted], device="cpu")
     return wanted.numpy()

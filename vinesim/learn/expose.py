@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import warp as wp
 
@@ -11,7 +9,8 @@ from vinesim.core import frames
 from vinesim.kernels.graph import KernelLaunch
 from vinesim.kernels.learn import expose as kernels
 from vinesim.learn.arm import AXES
-from vinesim.learn.arm_env import DISTANCE, ArmEnv
+from vinesim.learn.arm_env import ArmEnv
+from vinesim.learn.arm_task import DISTANCE, ArmTask
 from vinesim.learn.shoots import shoots
 from vinesim.learn.variation import Variation
 from vinesim.scene.model import Model
@@ -30,6 +29,35 @@ SPEED = 0.1
 """[m/s] Speed below which the hiding bunch is held, not swinging. GUESSED."""
 
 
+class Expose(ArmTask):
+    """The task of :class:`ExposeEnv`. The wanted bunch is that of the first shoot."""
+
+    name = "expose"
+    numbers = 2 * len(AXES) + 3 * 2 + 2
+
+    @staticmethod
+    def plants(rng: np.random.Generator, variation: Variation) -> Model:
+        """Returns a shoot with the wanted bunch, and one whose bunch hangs between it and the eye."""
+        wanted, hiding = (shoots(1, rng, AWAY, variation) for _ in range(2))
+        back, front = _middle(wanted), _middle(hiding)
+        hiding.tree_pose[0, :3] += np.array(EYE) + rng.uniform(*FRONT) * (back - np.array(EYE)) - front
+        return joined([wanted, hiding])
+
+    def observe(self, action: wp.array, observation: wp.array, reward: wp.array, success: wp.array) -> KernelLaunch:
+        """See :meth:`ArmTask.observe`."""
+        numbers = kernels.ExposeNumbers()
+        numbers.eye = wp.vec3(*EYE)
+        numbers.share = SHARE
+        numbers.speed = SPEED
+        numbers.success_reward = 10.0
+        numbers.force_cost = 0.02
+        numbers.action_cost = 0.01
+        arrays = self.arrays
+        given = [numbers, arrays.arm, *arrays.bunches, arrays.body_qd, arrays.bunch_size, arrays.worlds]
+        given += [arrays.capsules, action, arrays.contacts, arrays.world_contacts]
+        return KernelLaunch(kernels.observe, given, [observation, reward, success], threads=arrays.worlds)
+
+
 class ExposeEnv(ArmEnv):
     """Make a bunch visible that the bunch of another shoot hides, in ``num_envs`` worlds with different shoots.
 
@@ -44,47 +72,10 @@ class ExposeEnv(ArmEnv):
     shoot, minus 0.01 for each unit of squared action. Success: eight of nine points are visible, and the hiding bunch
     moves by less than 0.1 m/s. An episode ends at success, and is truncated after 100 actions (4 s).
 
-    ``options``: arguments of :class:`~vinesim.learn.arm_env.ArmEnv`, which also describes actions.
+    :class:`~vinesim.learn.arm_env.ArmEnv` describes arguments and actions.
     """
 
-    def __init__(self, num_envs: int = 1, **options: Any) -> None:
-        super().__init__(_plants, 2 * len(AXES) + 3 * 2 + 2, num_envs, **options)
-
-    def _beginnings(self) -> list[KernelLaunch]:
-        return []
-
-    def _observations(self, observation: wp.array, reward: wp.array, success: wp.array) -> list[KernelLaunch]:
-        worlds = self.worlds
-        model = worlds.model
-        numbers = kernels.ExposeNumbers()
-        numbers.eye = wp.vec3(*EYE)
-        numbers.share = SHARE
-        numbers.speed = SPEED
-        numbers.success_reward = 10.0
-        numbers.force_cost = 0.02
-        numbers.action_cost = 0.01
-        arrays = self.arm_arrays
-        given = [
-            numbers,
-            arrays.arm,
-            *arrays.bunches,
-            worlds.plants.launches.resident_arrays["body_qd"],
-            self.on_device(np.stack([model.bunch_length, model.bunch_radius], -1), wp.vec2),
-            self.num_envs,
-            worlds.contacts.capsules,
-            self._given_action,
-            arrays.contacts,
-            arrays.world_contacts,
-        ]
-        return [KernelLaunch(kernels.observe, given, [observation, reward, success], threads=self.num_envs)]
-
-
-def _plants(rng: np.random.Generator, variation: Variation) -> Model:
-    """Returns a shoot with the wanted bunch, and one whose bunch hangs between it and the eye."""
-    wanted, hiding = (shoots(1, rng, AWAY, variation) for _ in range(2))
-    back, front = _middle(wanted), _middle(hiding)
-    hiding.tree_pose[0, :3] += np.array(EYE) + rng.uniform(*FRONT) * (back - np.array(EYE)) - front
-    return joined([wanted, hiding])
+    task_class = Expose
 
 
 def _middle(model: Model) -> np.ndarray:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
 
 from vinesim.core import frames
+from vinesim.interaction.blades import Blade
 from vinesim.interaction.cutting_force import DORMANT_ENERGY_SHARE, DORMANT_STRENGTH
 from vinesim.kernels.graph import KernelLaunch
 from vinesim.kernels.learn import prune as kernels
-from vinesim.kernels.learn.episodes import draw_targets
 from vinesim.learn.arm import AXES, pruning_blade
+from vinesim.learn.arm_arrays import ArmArrays
 from vinesim.learn.arm_env import ArmEnv
+from vinesim.learn.arm_task import ArmTask
 from vinesim.learn.shoots import DENSITY, SPACING
 from vinesim.learn.variation import Variation
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
@@ -45,6 +47,60 @@ SLOTS = 32
 """Contacts that the plants of a world can have at once."""
 
 
+class Prune(ArmTask):
+    """The task of :class:`PruneEnv`."""
+
+    name = "prune"
+    numbers = 2 * len(AXES) + 6 + 3 * (CANES - 1) + 2 + CANES
+    actions = len(AXES) + 1
+    choices = CANES
+    parameters = PhysicsParameters(cutting_strength=DORMANT_STRENGTH, cutting_energy_share=DORMANT_ENERGY_SHARE)
+
+    def __init__(self, arrays: ArmArrays) -> None:
+        super().__init__(arrays)
+        self._is_done = self._each(wp.bool)
+
+    @staticmethod
+    def plants(rng: np.random.Generator, variation: Variation) -> Model:
+        """Returns two canes."""
+        return canes(rng, variation)
+
+    @staticmethod
+    def blade() -> Blade | None:
+        """Returns the blade of the shears."""
+        return pruning_blade()
+
+    def moves(self, action: wp.array, dt: float) -> list[KernelLaunch]:
+        """See :meth:`ArmTask.moves`."""
+        arrays = self.arrays
+        close = KernelLaunch(kernels.close_blade, [len(AXES), action], [arrays.closing], threads=arrays.worlds)
+        return [*super().moves(action, dt), close]
+
+    def counts(self) -> list[KernelLaunch]:
+        """See :meth:`ArmTask.counts`."""
+        arrays = self.arrays
+        given = [self._numbers(), arrays.worlds, arrays.canes, self.wanted]
+        return [KernelLaunch(kernels.judge_cuts, given, [self._is_done, self.failed], threads=arrays.worlds)]
+
+    def observe(self, action: wp.array, observation: wp.array, reward: wp.array, success: wp.array) -> KernelLaunch:
+        """See :meth:`ArmTask.observe`."""
+        arrays = self.arrays
+        given = [self._numbers(), arrays.worlds, arrays.arm, arrays.canes, self.wanted, self._is_done, action]
+        given += [arrays.contacts, arrays.world_contacts]
+        return KernelLaunch(kernels.observe, given, [observation, reward, success], threads=arrays.worlds)
+
+    def _numbers(self) -> kernels.PruneNumbers:
+        numbers = kernels.PruneNumbers()
+        numbers.kept = KEPT
+        numbers.tolerance = TOLERANCE
+        numbers.bud = BUD
+        numbers.success_reward = 10.0
+        numbers.distance_cost = 1.0
+        numbers.force_cost = 0.02
+        numbers.action_cost = 0.01
+        return numbers
+
+
 class PruneEnv(ArmEnv):
     """Prune one cane of two to two buds, in ``num_envs`` worlds with different canes.
 
@@ -64,83 +120,12 @@ class PruneEnv(ArmEnv):
     Success: the wanted cane is cut within 10 mm of the middle of that internode. An episode ends at success. It ends
     with a reward lower by 2 if a cane is cut elsewhere. It is truncated after 100 actions (4 s).
 
-    ``options``: arguments of :class:`~vinesim.learn.arm_env.ArmEnv`. Of the variation, the canes take ``cane``
-    (their length), thickness, modulus and damping. Raises :class:`ValueError` for canes that swing too fast.
+    :class:`~vinesim.learn.arm_env.ArmEnv` describes arguments. Of the variation, the canes take ``cane`` (their
+    length), thickness, modulus and damping. Raises :class:`ValueError` for canes that swing too fast.
     """
 
-    def __init__(self, num_envs: int = 1, **options: Any) -> None:
-        device = options.get("device", "cpu")
-        self._target = wp.zeros(max(num_envs, 1), dtype=wp.int32, device=device)
-        self._is_done = wp.zeros(max(num_envs, 1), dtype=wp.bool, device=device)
-        super().__init__(
-            canes,
-            2 * len(AXES) + 6 + 3 * (CANES - 1) + 2 + CANES,
-            num_envs,
-            actions=len(AXES) + 1,
-            blade=pruning_blade(),
-            slots=SLOTS,
-            parameters=PhysicsParameters(cutting_strength=DORMANT_STRENGTH, cutting_energy_share=DORMANT_ENERGY_SHARE),
-            **options,
-        )
-
-    def _moves(self) -> list[KernelLaunch]:
-        pool = self.worlds.pool
-        assert pool is not None, "the arm has a blade"
-        given = [len(AXES), self._action]
-        return [*super()._moves(), KernelLaunch(kernels.close_blade, given, [pool.closing], threads=self.num_envs)]
-
-    def _beginnings(self) -> list[KernelLaunch]:
-        given = [CANES, self._seed, self._begins]
-        return [KernelLaunch(draw_targets, given, [self._episode, self._target], threads=self.num_envs)]
-
-    def _judgements(self, results: Any) -> list[KernelLaunch]:
-        given = [self._numbers(), self.num_envs, self._places(), self._target]
-        judge = KernelLaunch(kernels.judge_cuts, given, [self._is_done, self._failed], threads=self.num_envs)
-        return [judge, *super()._judgements(results)]
-
-    def _observations(self, observation: wp.array, reward: wp.array, success: wp.array) -> list[KernelLaunch]:
-        arrays = self.arm_arrays
-        given = [self._numbers(), self.num_envs, arrays.arm, self._places(), self._target, self._is_done]
-        given += [self._given_action, arrays.contacts, arrays.world_contacts]
-        return [KernelLaunch(kernels.observe, given, [observation, reward, success], threads=self.num_envs)]
-
-    def _numbers(self) -> kernels.PruneNumbers:
-        numbers = kernels.PruneNumbers()
-        numbers.tolerance = TOLERANCE
-        numbers.bud = BUD
-        numbers.success_reward = 10.0
-        numbers.distance_cost = 1.0
-        numbers.force_cost = 0.02
-        numbers.action_cost = 0.01
-        return numbers
-
-    def _places(self) -> kernels.CanePlaces:
-        plants = self.worlds.plants
-        pool = self.worlds.pool
-        assert pool is not None, "the arm has a blade"
-        model = self.worlds.model
-        base = np.zeros(plants.buffers.slot_count, np.float32)
-        base[plants.buffers.slots] = _distances(model)
-        arrays = plants.launches.resident_arrays
-        places = kernels.CanePlaces()
-        places.first = arrays["tree_first"]
-        places.size = arrays["tree_size"]
-        places.pitch = plants.buffers.pitch
-        places.kept = KEPT
-        places.base = self.on_device(base, float)
-        places.body_q = arrays["body_q"]
-        places.parts, places.is_cut = pool.canes.parts
-        places.length = places.parts.length
-        return places
-
-
-def _distances(model: Model) -> np.ndarray:
-    """Returns the distance [body] m along each cane from its base to a body."""
-    along = np.zeros(len(model.body_mass))
-    for number in range(1, INTERNODES):
-        body = model.tree_first + number
-        along[body] = along[body - 1] + model.body_length[body - 1]
-    return along
+    task_class = Prune
+    world_options: ClassVar[dict[str, Any]] = {"slots": SLOTS}
 
 
 def least_length(thickness: float, modulus: float) -> float:

@@ -142,8 +142,6 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         self._episode = self.empty(wp.int32)
         self._begins = self.empty(wp.bool)
         self._nowhere = self.empty(wp.bool)
-        self._failed = self.empty(wp.bool)
-        """[world] Whether success is no longer possible, so that the episode ends. Judgements may write it."""
         unused = (self.empty(float), self.empty(wp.bool))
         each = {"threads": self.num_envs, "width": actions}
         delay = KernelLaunch(delay_actions, [self._delay, self._given_action], [self._history, self._action], **each)
@@ -188,11 +186,21 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
     def _beginnings(self) -> list[KernelLaunch]:
         """Returns the launches that begin an episode in the worlds of ``_begins``, after their reset."""
 
+    @property
+    @abc.abstractmethod
+    def _failed(self) -> wp.array:
+        """[world] Whether success is no longer possible, so that the episode ends."""
+
+    def _counts(self) -> list[KernelLaunch]:
+        """Returns the launches that follow once after each action, before the observations."""
+        return []
+
     def _judgements(self, results: _Results) -> list[KernelLaunch]:
         given = [self.max_episode_steps, self.worlds.faults, self._failed]
         flags = [results.success, results.terminated, results.truncated, results.ended, results.fault]
         written = [self.elapsed, results.last, results.reward, *flags]
         return [
+            *self._counts(),
             *self._observations(results.last, results.reward, results.success),
             KernelLaunch(end_episodes, given, written, threads=self.num_envs),
         ]

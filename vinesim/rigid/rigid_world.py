@@ -776,6 +776,11 @@ class RigidWorld(MujocoWorld):
         qpos = self._bunch_joint(bunch).qpos
         return np.concatenate([qpos[:3], frames.from_wxyz(qpos[3:])])
 
+    def bunch_rates(self, bunch: int) -> np.ndarray:
+        """Returns the velocity [6] of a free bunch as MuJoCo has it: linear of its origin [m/s] in world axes, then
+        angular [rad/s] in its own axes."""
+        return self._bunch_joint(bunch).qvel
+
     def _bunch_joint(self, bunch: int) -> Any:  # MuJoCo's view of a joint has no public type
         return self.mj_data.joint(free_bunch.slot_name(self._bunch_slot[bunch]))
 

@@ -82,6 +82,40 @@ def draw_targets(
 
 
 @wp.kernel
+def begin_on_way(
+    # model
+    share: float,
+    home: wp.array(dtype=float),
+    goals: wp.array3d(dtype=float),
+    q: wp.array(dtype=wp.int32),
+    # in
+    seed: wp.array(dtype=wp.int32),
+    begins: wp.array(dtype=wp.bool),
+    episode: wp.array(dtype=wp.int32),
+    target: wp.array(dtype=wp.int32),
+    # out
+    qpos_out: wp.array2d(dtype=float),
+    targets_out: wp.array2d(dtype=float),
+):
+    """One thread per world. Let a ``share`` of the episodes that begin do so with the arm on its way from ``home``
+    [joint] rad to a goal: at a place of this way that is drawn evenly.
+
+    goals: [world, target, joint] rad, for each target. q: [joint] index in qpos. seed, episode, target: see
+    :func:`draw_targets`, which has been launched before. targets: [world, joint] rad, of the servos.
+    """
+    world = wp.tid()
+    if begins[world]:
+        state = wp.rand_init(seed[0] - episode[world], world)
+        if wp.randf(state) < share:
+            way = wp.randf(state)
+            for i in range(q.shape[0]):
+                angle = home[i] + way * (goals[world, target[world], i] - home[i])
+                at = q[i]
+                qpos_out[world, at] = angle
+                targets_out[world, i] = angle
+
+
+@wp.kernel
 def delay_actions(
     # in
     delay: wp.array(dtype=wp.int32),

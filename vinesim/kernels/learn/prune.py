@@ -5,7 +5,6 @@ import warp as wp
 
 from vinesim.kernels.contact.structs import Contacts
 from vinesim.kernels.learn.reach import ArmState, force_on_others, observe_arm, squared_action
-from vinesim.kernels.worlds.cutting import Canes
 from vinesim.kernels.worlds.narrowphase import WorldContacts
 
 wp.set_module_options({"enable_backward": False})
@@ -15,6 +14,8 @@ wp.set_module_options({"enable_backward": False})
 class PruneNumbers:
     """Numbers of the task."""
 
+    kept: int
+    """Number of buds that shall stay: bud i is at the tip of internode i, from 1 on."""
     tolerance: float
     """[m] Largest distance of a cut from the wanted place, along the cane."""
     bud: float
@@ -37,23 +38,24 @@ class CanePlaces:
     """[tree] Number of bodies."""
     pitch: int
     """Distance in memory from one body of a tree to the next."""
-    kept: int
-    """Number of buds that shall stay: bud i is at the tip of internode i, from 1 on."""
     length: wp.array(dtype=float)
     """[body] m, length of the internode."""
     base: wp.array(dtype=float)
     """[body] m, distance along the cane from its base to the internode."""
     body_q: wp.array(dtype=wp.transform)
-    parts: Canes
+    segment: wp.array(dtype=wp.int32)
+    """[body] Internode of which the body is a part; -1: a spare body."""
+    start: wp.array(dtype=float)
+    """[body] m, from the origin of the internode to the beginning of the body's wood."""
     is_cut: wp.array(dtype=wp.bool)
     """[body] Whether a body was cut off."""
 
 
 @wp.func
-def wanted_place(tree: int, canes: CanePlaces):
+def wanted_place(tree: int, kept: int, canes: CanePlaces):
     """Returns the point [m] at which a cane shall be cut, the middle of the internode above the last bud that stays,
     and the direction of the cane there."""
-    body = canes.first[tree] + canes.kept * canes.pitch
+    body = canes.first[tree] + kept * canes.pitch
     pose = canes.body_q[body]
     point = wp.transform_point(pose, wp.vec3(0.5 * canes.length[body], 0.0, 0.0))
     return point, wp.transform_vector(pose, wp.vec3(1.0, 0.0, 0.0))
@@ -66,8 +68,8 @@ def lowest_cut(tree: int, canes: CanePlaces):
     first = canes.first[tree]
     for k in range(first, first + canes.size[tree] * canes.pitch, canes.pitch):
         if canes.is_cut[k]:
-            segment = canes.parts.segment[k]
-            lowest = wp.min(lowest, canes.base[segment] + canes.parts.start[k])
+            segment = canes.segment[k]
+            lowest = wp.min(lowest, canes.base[segment] + canes.start[k])
     return lowest
 
 
@@ -76,12 +78,12 @@ def force_on_buds(
     world: int,
     worlds: int,
     wanted: int,
-    reach: float,
+    numbers: PruneNumbers,
     canes: CanePlaces,
     contacts: Contacts,
     world_contacts: WorldContacts,
 ):
-    """Returns the sum of the contact forces [N] within ``reach`` [m] of the buds of the wanted cane that shall stay."""
+    """Returns the sum of the contact forces [N] near the buds of the wanted cane that shall stay."""
     force = float(0.0)
     tree = wanted * worlds + world
     for c in range(world_contacts.count[world]):
@@ -89,9 +91,9 @@ def force_on_buds(
         if world_contacts.tree[at] / worlds == wanted:
             point = wp.vec3(contacts.point[at])
             near = bool(False)
-            for i in range(1, canes.kept + 1):
+            for i in range(1, numbers.kept + 1):
                 bud = wp.transform_get_translation(canes.body_q[canes.first[tree] + i * canes.pitch])
-                near = near or wp.length(point - bud) < reach
+                near = near or wp.length(point - bud) < numbers.bud
             if near:
                 force = force + float(wp.length(contacts.force[at]))
     return force
@@ -132,7 +134,7 @@ def judge_cuts(
         tree = number * worlds + world
         place = lowest_cut(tree, canes)
         if wp.isfinite(place):
-            body = canes.first[tree] + canes.kept * canes.pitch
+            body = canes.first[tree] + numbers.kept * canes.pitch
             apart = wp.abs(place - canes.base[body] - 0.5 * canes.length[body])
             if number == target[world] and apart <= numbers.tolerance:
                 done = True
@@ -170,7 +172,7 @@ def observe(
     mouth = observe_arm(world, arm, observation_out)
     place = int(2 * arm.q.shape[0])
     wanted = target[world]
-    point, along = wanted_place(wanted * worlds + world, canes)
+    point, along = wanted_place(wanted * worlds + world, numbers.kept, canes)
     away = point - mouth
     for k in range(3):
         observation_out[world, place + k] = away[k]
@@ -178,12 +180,12 @@ def observe(
     place = place + 6
     for other in range(trees):
         if other != wanted:
-            apart, _along = wanted_place(other * worlds + world, canes)
+            apart, _along = wanted_place(other * worlds + world, numbers.kept, canes)
             for k in range(3):
                 observation_out[world, place + k] = apart[k] - mouth[k]
             place = place + 3
     on_others = force_on_others(world, worlds, wanted, contacts, world_contacts)
-    on_buds = force_on_buds(world, worlds, wanted, numbers.bud, canes, contacts, world_contacts)
+    on_buds = force_on_buds(world, worlds, wanted, numbers, canes, contacts, world_contacts)
     observation_out[world, place] = on_others
     observation_out[world, place + 1] = on_buds
     for k in range(trees):
