@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -11,9 +12,10 @@ pytest.importorskip("vinesim.learn")
 import gymnasium
 
 from tests.learn.arm_control import towards
-from vinesim.learn.prune import INTERNODES, KEPT, TOLERANCE, canes
+from vinesim.learn.prune import CANES, INTERNODES, KEPT, TOLERANCE, canes, least_length
 from vinesim.learn.variation import Variation
 from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
 
@@ -126,15 +128,37 @@ def test_a_finger_that_presses_a_bud_costs_its_force(environment: Any) -> None:
     assert (most > 0.5).any()
 
 
+def _substeps(model: Model) -> list[int]:
+    plants = ArticulationSolver(model, State.at_rest(model), PhysicsParameters(sleep=False))
+    plants.wake(np.arange(len(model.tree_first)))
+    plants.upload()
+    return plants.tree_substeps.tolist()
+
+
 def test_no_cane_swings_too_fast_for_the_step() -> None:
     """In 200 worlds, with the default variation."""
     for number in range(200):
         model = canes(np.random.default_rng([0, number]), Variation())
         assert (model.tree_core - model.tree_spares == INTERNODES).all()
-        plants = ArticulationSolver(model, State.at_rest(model), PhysicsParameters(sleep=False))
-        plants.wake(np.arange(len(model.tree_first)))
-        plants.upload()
-        assert (plants.tree_substeps == 1).all()
+        assert _substeps(model) == [1] * CANES
+
+
+@pytest.mark.parametrize(("thickness", "modulus"), [(0.007, 2e9), (0.01, 6e9), (0.013, 1e10)])
+def test_canes_have_the_length_of_the_variation_down_to_the_one_that_swings_too_fast(
+    thickness: float, modulus: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    least = least_length(thickness, modulus)
+    given = Variation(cane=(1.001 * least, 1.001 * least), thickness=(thickness,) * 2, modulus=(modulus,) * 2)
+    model = canes(np.random.default_rng(0), given)
+    lengths = model.body_length[~model.is_spare()].reshape(CANES, INTERNODES).sum(1)
+    np.testing.assert_allclose(lengths, 1.001 * least, rtol=1e-5)
+    assert _substeps(model) == [1] * CANES
+    shorter = msgspec.structs.replace(given, cane=(0.998 * least, 2.0))
+    with pytest.raises(ValueError, match=rf"^cane from .*: below {least:.3f} m, .* swing too fast; give longer.*$"):
+        canes(np.random.default_rng(0), shorter)
+    monkeypatch.setattr("vinesim.learn.prune.LEAST_LENGTH", 0.0)
+    short = canes(np.random.default_rng(0), msgspec.structs.replace(given, cane=(0.998 * least,) * 2))
+    assert _substeps(short) == [2] * CANES
 
 
 def test_equal_seeds_and_actions_give_equal_episodes_to_the_bit(environment: Any) -> None:

@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -21,7 +22,9 @@ from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapsho
 
 pytest.importorskip("mujoco_warp")
 from tests.physics.test_worlds import HAND, PARAMETERS, bunches, targets
+from tests.physics.test_worlds_canes import BLADE, SHEARS, hanging
 from tests.physics.test_worlds_cutting import blade, client
+from tests.physics.test_worlds_overload import ROBOT, weak
 from vinesim.learn.arm import arm
 from vinesim.learn.shoots import shoots
 from vinesim.sensors.camera.world_cameras import WorldCamera, WorldCameras, bunches_of_worlds
@@ -274,6 +277,112 @@ def test_a_bunch_that_is_cut_off_looks_as_in_a_client() -> None:
     worlds.reset()
     cameras.render()
     np.testing.assert_array_equal(cameras.labels.numpy(), first)
+
+
+@pytest.mark.parametrize("pitch", [1, 4], ids=["in order", "interleaved"])
+def test_canes_that_are_cut_look_as_in_a_client(pitch: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nearly weightless, so that pieces come off slowly. The first cut parts the upper segment of a cane, the
+    second one the piece, the third one the stump. The second world is not cut. After a reset the cane is whole."""
+
+    def solver(*given: Any, device: str) -> ArticulationSolver:
+        return ArticulationSolver(*given, buffers=DeviceBuffers(device, pitch))
+
+    monkeypatch.setattr("vinesim.worlds.worlds.ArticulationSolver", solver)
+    parameters = msgspec.structs.replace(PARAMETERS, gravity=0.3)
+    physics = client(hanging(1), SHEARS, parameters)
+    cutter = physics.add_blade("shears", "head", BLADE.pose, BLADE.half)
+    worlds = Worlds(hanging(2), 2, robots=[SHEARS], parameters=parameters, blade=BLADE)
+    assert worlds.pool is not None
+    middle = np.array([0.0, 0.0, 1.03])
+    camera = WorldCamera(pose=look_at(middle + np.array([0.3, -0.4, 0.0]), middle), field_of_view=0.8)
+    cameras = WorldCameras(worlds, [camera], SIZE)
+    paint = np.random.default_rng(0).uniform(0.1, 0.9, (cameras.primitives, 3)).astype(np.float32)
+    cameras._tables.looks.tint.assign(np.tile(paint, (2, 1)))  # so that stumps without the colour of the cane are seen
+    cameras.render()
+    assert cameras.rgb is not None
+    first = [array.numpy().copy() for array in (cameras.labels, cameras.depth, cameras.rgb)]
+    for tick, height in enumerate([0.1] * 60 + [0.0] * 60 + [0.15] * 60):
+        physics.rigid.command("shears", np.array([height]))
+        worlds.bodies.targets.assign(np.full((2, 1), height, np.float32))
+        if tick % 60 == 20:
+            cutter.close()
+            worlds.pool.closing.assign(np.array([True, False]))
+        physics.step()
+        worlds.step()
+        if tick % 60 == 59:
+            cameras.render()
+            labels, depth = cameras.labels.numpy(), cameras.depth.numpy()
+            other, truth, _ = seen_by_client(physics.model, physics.snapshot(), camera, camera.pose)
+            canes = [seen // LABEL_STRIDE == int(Organ.CANE) for seen in (labels[0, 0], labels[1, 0], other)]
+            assert (canes[0] == canes[2]).sum() >= canes[0].size - 2
+            assert (canes[0] != canes[1]).sum() > 4
+            assert_equal_pictures(labels[0, 0], depth[0, 0], other, truth)
+            assert (labels[1] == first[0][1]).mean() >= 0.995
+            is_stump = canes[0] & canes[1]
+            is_stump[12:] = False  # lower rows show what has fallen
+            assert is_stump.sum() > 10
+            colours = cameras.rgb.numpy().astype(int)[:, 0, is_stump]
+            assert np.abs(colours[0] - colours[1]).mean() < 2.0
+    assert (worlds.pool.canes.parts[0].segment.numpy()[worlds.plants.buffers.slots] >= 0).sum() == 2 * 4 + 3
+    assert not worlds.faults.numpy().any()
+    worlds.reset()
+    cameras.render()
+    for array, expected in zip((cameras.labels, cameras.depth, cameras.rgb), first, strict=True):
+        np.testing.assert_array_equal(array.numpy(), expected)
+
+
+@pytest.mark.parametrize(
+    ("seed", "pull", "bend", "strength", "rate"),
+    [
+        pytest.param(1, 4.0, 5.0, 0.0, 1.0, id="a peduncle at the shoot"),
+        pytest.param(3, 3.5, 50.0, 0.0, 2.0, id="a peduncle at the bunch"),
+        pytest.param(1, 500.0, 500.0, 4e7, 6.0, id="a cane"),
+    ],
+)
+def test_wood_that_breaks_looks_as_in_a_client(
+    seed: int, pull: float, bend: float, strength: float, rate: float
+) -> None:
+    """A tenth of a second after the wood has parted, when poses differ by some micrometres. After a reset all is
+    whole."""
+    model = weak(seed, pull, bend)
+    model.body_strength[model.body_organ == int(Organ.CANE)] = strength
+    model.body_toughness[:] = 1e3
+    physics = client(model, ROBOT)
+    at_rest = physics.snapshot()
+    at_rest = dataclasses.replace(at_rest, body_q=at_rest.body_q.copy())
+    start = np.random.default_rng(seed).normal(0.0, rate, physics.state.joint_qd.shape)
+    worlds = Worlds(model, 1, robots=[ROBOT], parameters=PARAMETERS, breaks=True)
+    physics.state.joint_qd[:] = start
+    worlds.plants.state.joint_qd[:] = start
+    worlds.plants.upload()
+    broke = -1
+    for tick in range(150):
+        physics.step()
+        worlds.step()
+        if physics.detachments and broke < 0:
+            broke = tick
+        if 0 <= broke == tick - 10:
+            break
+    assert broke >= 0
+    snapshot = physics.snapshot()
+    falls = snapshot.visual_q[-1] if strength == 0.0 else snapshot.body_q[model.bunch_body[0]]
+    middle = falls[:3].astype(float)
+    camera = WorldCamera(pose=look_at(middle + np.array([0.6, -0.6, 0.3]), middle), field_of_view=0.9)
+    cameras = WorldCameras(worlds, [camera], SIZE)
+    cameras.render()
+    labels, depth = cameras.labels.numpy()[0, 0], cameras.depth.numpy()[0, 0]
+    other, truth, _ = seen_by_client(physics.model, snapshot, camera, camera.pose)
+    same = labels == other
+    assert same.mean() >= 0.995
+    near = same & (truth < NEAR)
+    assert (np.abs(depth[near] - truth[near]) < 1e-3).mean() >= 0.995
+    assert (labels // LABEL_STRIDE == int(Organ.BUNCH)).sum() > 40
+    assert (labels // LABEL_STRIDE == int(Organ.CANE)).sum() > 10
+    assert not worlds.faults.numpy().any()
+    worlds.reset()
+    cameras.render()
+    labels, depth = cameras.labels.numpy()[0, 0], cameras.depth.numpy()[0, 0]
+    assert_equal_pictures(labels, depth, *seen_by_client(physics.model, at_rest, camera, camera.pose)[:2])
 
 
 def _mouth() -> tuple[np.ndarray, np.ndarray]:

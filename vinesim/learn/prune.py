@@ -29,8 +29,12 @@ KEPT = 2
 """Number of buds that shall stay."""
 INTERNODES = 16
 """Number of internodes of a cane, each a body, with a bud at its tip."""
-LENGTH = (1.1, 1.5)
-"""[m] Length of a cane. GUESSED. A shorter one may swing too fast for a step of 10 ms."""
+TIP = 0.6
+"""Thickness of a cane at its tip, relative to its base. GUESSED."""
+LEAST_LENGTH = 0.03462
+"""Length [m] of a cane whose first mode is as fast as a batch permits in a step of 10 ms (4.8 Hz), with a diameter of
+1 m at its base and a modulus of 1 Pa. DERIVED: measured for :data:`TIP`, :data:`INTERNODES` and the density. The length
+of other canes grows with the root of the diameter and the fourth root of the modulus."""
 DISTANCE = 0.85
 """[m] Mean distance of the canes from the origin."""
 HEIGHT = 0.7
@@ -116,16 +120,29 @@ class PruneEnv(ArmEnv):
     Success: the wanted cane is cut within 10 mm of the middle of that internode. An episode ends at success. It ends
     with a reward lower by 2 if a cane is cut elsewhere. It is truncated after 100 actions (4 s).
 
-    :class:`~vinesim.learn.arm_env.ArmEnv` describes arguments. Of the variation, the canes take thickness, modulus and
-    damping.
+    :class:`~vinesim.learn.arm_env.ArmEnv` describes arguments. Of the variation, the canes take ``cane`` (their
+    length), thickness, modulus and damping. Raises :class:`ValueError` for canes that swing too fast.
     """
 
     task_class = Prune
     world_options: ClassVar[dict[str, Any]] = {"slots": SLOTS}
 
 
+def least_length(thickness: float, modulus: float) -> float:
+    """Returns the least length [m] of a cane that does not swing too fast, by its diameter [m] and modulus [Pa]."""
+    return LEAST_LENGTH * thickness**0.5 * modulus**0.25
+
+
 def canes(rng: np.random.Generator, variation: Variation) -> Model:
-    """Returns :data:`CANES` upright dormant canes in front of the arm. Places and directions are GUESSED."""
+    """Returns :data:`CANES` upright dormant canes in front of the arm. Places and directions are GUESSED. Raises
+    :class:`ValueError` if canes in these ranges may swing too fast for a step of 10 ms."""
+    least = least_length(variation.thickness[1], variation.modulus[1])
+    if variation.cane[0] < least:
+        raise ValueError(
+            f"cane from {variation.cane[0]:g}: below {least:.3f} m, canes with a thickness of up to "
+            f"{variation.thickness[1]:g} m and a modulus of up to {variation.modulus[1]:g} Pa swing too fast; "
+            "give longer, thinner or softer ones"
+        )
     side = SPACING * (np.arange(CANES) - 0.5 * (CANES - 1))
     return with_spares(assemble([_cane(rng, float(y), variation) for y in side]), 1)
 
@@ -137,6 +154,6 @@ def _cane(rng: np.random.Generator, side: float, variation: Variation) -> TreeBu
     modulus = rng.uniform(*variation.modulus)
     wood = RodMaterial(modulus, DENSITY, rng.uniform(*variation.damping), shear_modulus=0.4 * modulus)
     up = frames.from_x_axis(np.array([*rng.uniform(-0.2, 0.2, 2), 1.0]))
-    tree.add_rod(-1, rng.uniform(*LENGTH), (radius, 0.6 * radius), wood, INTERNODES, rest=up)
+    tree.add_rod(-1, rng.uniform(*variation.cane), (radius, TIP * radius), wood, INTERNODES, rest=up)
     tree.solve_rest_pose()
     return tree

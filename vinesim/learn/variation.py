@@ -33,6 +33,8 @@ class Variation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     20(3):6662); the lower end is GUESSED, for half-green ones."""
     damping: Range = (0.02, 0.02)
     """[s] Damping of a shoot's joints, per stiffness. GUESSED; bare canes have 0.008 s (docs/plants.md)."""
+    cane: Range = (1.1, 1.5)
+    """[m] Length of a dormant cane. GUESSED. The task *prune* refuses canes so short that they swing too fast."""
     peduncle: Range = (0.05, 0.1)
     """[m] Length of a peduncle. GUESSED."""
     bunch_mass: Range = (0.2, 0.5)

@@ -26,6 +26,7 @@ from vinesim.kernels.shading.deferred import Light, sky_radiance, surface_light
 from vinesim.kernels.shading.materials import Materials
 from vinesim.kernels.shading.shadow_maps import ShadowMap
 from vinesim.kernels.shading.tone_rows import tone_entry
+from vinesim.kernels.worlds.cutting import Canes
 from vinesim.kernels.worlds.reset import MOTION
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -42,6 +43,12 @@ STALK = wp.constant(4)
 """A segment of a peduncle: a plant's body carries what a cut leaves of it."""
 PIECE = wp.constant(5)
 """The part of a segment of a peduncle that a bunch has taken along; not seen before."""
+WOOD = wp.constant(6)
+"""A segment of a cane: a plant's body carries the part that cuts leave to it."""
+STUMP = wp.constant(7)
+"""A spare body: the part of a segment of a cane that a cut has made of it; not seen before."""
+GROWN = wp.constant(8)
+"""A node or a bud of a cane: the part of the segment on which it grows carries it."""
 
 TILE_WIDTH = wp.constant(8)
 """Width of a tile [px]: the 32 threads of a warp draw a tile of 8 x 4 pixels, which the same primitives cover."""
@@ -83,7 +90,7 @@ class Variants:
     first_cluster: wp.array(dtype=wp.int32)
     """[variant + 1] First cluster of each variant."""
     role: wp.array(dtype=wp.int32)
-    """[primitive] How the primitive moves: :data:`PLANT` to :data:`PIECE`."""
+    """[primitive] How the primitive moves: :data:`PLANT` to :data:`GROWN`."""
     tree: wp.array(dtype=wp.int32)
     """[primitive] Tree of the world; of rigid primitives not used."""
     body: wp.array(dtype=wp.int32)
@@ -92,6 +99,12 @@ class Variants:
     """[primitive] Number of the bunch in its world, -1 for none."""
     above: wp.array(dtype=wp.int32)
     """[primitive] Number of segments of the peduncle between this one and the bunch; only of stalks."""
+    place: wp.array(dtype=float)
+    """[primitive] m, from the origin of the body to where the primitive grows; only of :data:`GROWN`."""
+    first_wood: wp.array(dtype=wp.int32)
+    """[primitive] First row of its tree in :attr:`wood`; only of :data:`STUMP`."""
+    wood: wp.array(dtype=wp.int32)
+    """[body] Number of the body's :data:`WOOD` in its variant, -1 for none. The bodies of a tree lie side by side."""
     offset: wp.array(dtype=wp.transform)
     """[primitive] Pose in the body of the pool, for bunches, or in the world, if nothing moves the primitive."""
 
@@ -124,6 +137,23 @@ class Motion:
     geom_quat: wp.array2d(dtype=wp.quat)
     geom_size: wp.array2d(dtype=wp.vec3)
     geom_margin: wp.array2d(dtype=float)
+    canes: Canes
+    """Parts of canes."""
+    spares: int
+    """Number of spare bodies of a tree that cuts can take."""
+    first_spare: wp.array(dtype=wp.int32)
+    """[tree] First spare body."""
+
+
+@wp.struct
+class Looks:
+    """How primitives look: [world * room + i] primitive i of a world."""
+
+    material: wp.array(dtype=wp.int32)
+    tint: wp.array(dtype=wp.vec3)
+    sky: wp.array(dtype=float)
+    """Share of the sky that is visible."""
+    label: wp.array(dtype=wp.int32)
 
 
 @wp.func
@@ -171,6 +201,43 @@ def slot_of_bunch(motion: Motion, world: int, bunch: int) -> int:
 
 
 @wp.func
+def tree_of(variants: Variants, motion: Motion, world: int, k: int) -> int:
+    """Returns the tree of the batch that carries primitive ``k`` of the variants in a world."""
+    return variants.tree[k] * motion.worlds + world
+
+
+@wp.func
+def body_of(variants: Variants, motion: Motion, world: int, k: int) -> int:
+    """Returns the plant's body in whose frame primitive ``k`` of the variants is, in a world."""
+    return motion.tree_first[tree_of(variants, motion, world, k)] + variants.body[k] * motion.pitch
+
+
+@wp.func
+def part_at(motion: Motion, tree: int, segment: int, place: float) -> int:
+    """Returns the part of a segment of a cane on which something grows, ``place`` [m] from the segment's origin."""
+    body = int(segment)
+    if place < motion.canes.start[segment]:  # it stays on a stump
+        for i in range(motion.spares):
+            spare = motion.first_spare[tree] + i * motion.pitch
+            is_here = motion.canes.start[spare] <= place and place < motion.canes.end[spare]
+            if motion.canes.segment[spare] == segment and is_here:
+                body = spare
+    return body
+
+
+@wp.func
+def wood_of_stump(variants: Variants, motion: Motion, world: int, k: int) -> int:
+    """Returns the primitive of the variants that is the whole segment of the stump ``k`` in a world, -1 for no stump."""
+    segment = motion.canes.segment[body_of(variants, motion, world, k)]
+    found = int(-1)
+    if segment >= 0:
+        number = (segment - motion.tree_first[tree_of(variants, motion, world, k)]) // motion.pitch
+        wood = variants.wood[variants.first_wood[k] + number]
+        found = variants.first_primitive[variants.of_world[world]] + wood
+    return found
+
+
+@wp.func
 def carrier_pose(variants: Variants, motion: Motion, world: int, k: int, slot: int) -> wp.transform:
     """Returns the pose [m] that moves primitive ``k`` of the variants in a world.
 
@@ -183,9 +250,31 @@ def carrier_pose(variants: Variants, motion: Motion, world: int, k: int, slot: i
     elif (role == BUNCH or role == PIECE) and slot >= 0:
         pose = wp.transform_multiply(rigid_pose(motion, world, motion.pool_body[slot]), pose)
     elif role != STATIC:
-        tree = variants.tree[k] * motion.worlds + world
-        pose = motion.body_q[motion.tree_first[tree] + variants.body[k] * motion.pitch]
+        body = body_of(variants, motion, world, k)
+        if role == GROWN:
+            body = part_at(motion, tree_of(variants, motion, world, k), body, variants.place[k])
+        pose = motion.body_q[body]
     return pose
+
+
+@wp.func
+def hidden(s: PosedPrimitive) -> PosedPrimitive:
+    """Returns a cone where no camera sees it."""
+    s.a = wp.vec4(0.0, 0.0, HIDDEN_HEIGHT, 1.0e-6)
+    s.b = wp.vec4(1.0e-3, 0.0, HIDDEN_HEIGHT, 1.0e-6)
+    return s
+
+
+@wp.func
+def cut_cane(s: PosedPrimitive, canes: Canes, body: int) -> PosedPrimitive:
+    """Returns the part of a segment of a cane that is ``body``. ``s``: the whole segment."""
+    length = canes.length[canes.segment[body]]
+    start = canes.start[body] / length
+    end = canes.end[body] / length
+    way = s.b - s.a
+    s.b = wp.where(end < 1.0, s.a + way * end, s.b)
+    s.a = s.a + way * start
+    return s
 
 
 @wp.func
@@ -214,8 +303,7 @@ def cut_stalk(s: PosedPrimitive, motion: Motion, world: int, role: int, above: i
                 s.a = with_w(wp.transform_point(at, wp.vec3(0.0, 0.0, -size[1])), size[0])
                 s.b = with_w(wp.transform_point(at, wp.vec3(0.0, 0.0, size[1])), size[0])
     if share == 0.0:
-        s.a = wp.vec4(0.0, 0.0, HIDDEN_HEIGHT, 1.0e-6)
-        s.b = wp.vec4(1.0e-3, 0.0, HIDDEN_HEIGHT, 1.0e-6)
+        s = hidden(s)
     elif share < 1.0:
         s.b = s.a + (s.b - s.a) * share
     return s
@@ -255,12 +343,14 @@ def pose_primitives(
     shapes_out: Shapes,
     bounds_out: wp.array3d(dtype=wp.vec3i),
     cluster_bounds_out: wp.array3d(dtype=wp.vec3i),
+    looks_out: Looks,
 ):
     """One thread transforms the primitives of one cluster of a world into the world, and bounds them in its pictures.
 
     local: [primitive] of the variants, in the frames of their carriers; clusters: of the variants; due: [world] whether
     the world's pictures are wanted; faults: [world], a world whose motion has one is not drawn. shapes: [world * room + i] primitive i of a world; bounds: [world, camera, i] of
-    primitives and cluster_bounds: [world, camera, i] of clusters, see :func:`packed_bounds`.
+    primitives and cluster_bounds: [world, camera, i] of clusters, see :func:`packed_bounds`. looks: a stump gets that
+    of its segment.
     """
     world, number = wp.tid()
     variant = variants.of_world[world]
@@ -273,15 +363,28 @@ def pose_primitives(
         for k in range(first, end):
             slot = slot_of_bunch(motion, world, variants.bunch[k])
             pose = carrier_pose(variants, motion, world, k, slot)
+            i = world * variants.room + k - base
+            role = variants.role[k]
+            whole = int(k)
+            if role == STUMP:
+                whole = wood_of_stump(variants, motion, world, k)
             s = PosedPrimitive()
-            if kind == LEAF:
+            if whole < 0:
+                s = hidden(s)
+            elif kind == LEAF:
                 s = pose_leaf(local, k, pose)
             else:
-                s = pose_solid(local, k, kind, pose)
-            role = variants.role[k]
+                s = pose_solid(local, whole, kind, pose)
             if role == STALK or role == PIECE:
                 s = cut_stalk(s, motion, world, role, variants.above[k], slot)
-            i = world * variants.room + k - base
+            elif (role == WOOD or role == STUMP) and whole >= 0:
+                s = cut_cane(s, motion.canes, body_of(variants, motion, world, k))
+            if whole >= 0 and whole != k:
+                like = i + whole - k
+                looks_out.material[i] = looks_out.material[like]
+                looks_out.tint[i] = looks_out.tint[like]
+                looks_out.sky[i] = looks_out.sky[like]
+                looks_out.label[i] = looks_out.label[like]
             shapes_out.a[i] = s.a
             shapes_out.b[i] = s.b
             shapes_out.c[i] = s.c
@@ -305,10 +408,10 @@ def pose_primitives(
                     nearest = wp.min(nearest, o.depth)
                 row = k - base
                 bounds_out[world, camera, row] = bounds
-            whole = NO_PIXELS
+            together = NO_PIXELS
             if low_x < high_x:
-                whole = packed_bounds(low_x, high_x, low_y, high_y, nearest)
-            cluster_bounds_out[world, camera, number] = whole
+                together = packed_bounds(low_x, high_x, low_y, high_y, nearest)
+            cluster_bounds_out[world, camera, number] = together
 
 
 @wp.func

@@ -41,6 +41,8 @@ LARGEST = 1024
 """[px] Largest width and height of a picture."""
 _COPIED = ("leaf_texture", "noise_texture", "soil_texture", "rows", "colours", "ground")
 """Fields of ``Materials`` that all worlds share."""
+_LOOKS = {"material": wp.int32, "label": wp.int32, "tint": wp.vec3, "sky": float}
+"""Fields of :class:`~vinesim.kernels.worlds.pictures.Looks`, with their types."""
 _OPEN = 40.0
 """[m] Width of the square around the origin that is the floor of a vineyard; beyond it are fields. GUESSED. One
 world must look the same in any batch, so the square does not follow the plants."""
@@ -178,12 +180,19 @@ class WorldCameras:
         motion.xpos = data.xpos
         motion.xquat = data.xquat
         motion.world_bunch = self._array(bunches_of_worlds(worlds.model, worlds.count), wp.int32)
+        motion.spares = _spares_for_cuts(worlds)
+        first_spare = np.zeros(0, np.int32)
+        if motion.spares:
+            plants = worlds.model
+            first_spare = worlds.plants.buffers.slots[plants.tree_first + plants.tree_core - plants.tree_spares]
+        motion.first_spare = self._array(first_spare, wp.int32)
         pool = worlds.pool
         if pool is None:
             motion.free_bunch = self._zeros(wp.int32, worlds.count, 0)
             motion.pool_body = motion.first_piece = self._zeros(wp.int32, 0)
             return motion
         model = worlds.bodies.model
+        motion.canes = pool.canes.parts[0]
         motion.free_bunch = pool.bunch
         motion.pool_body = pool.table.body
         motion.first_piece = self._array(pool.table.geom.numpy() + shapes_of_bunches(worlds.model)[0], wp.int32)
@@ -212,7 +221,9 @@ class WorldCameras:
         tables.bounds = [bounds, cluster_bounds]
         given = [tables.local, tables.clusters, tables.variants, views, motion, self._due, worlds.faults]
         shape = {"threads": worlds.count, "width": tables.clusters_room, "block": _BLOCKS[0]}
-        pose = KernelLaunch(kernels.pose_primitives, given, [tables.shapes, bounds, cluster_bounds], **shape)
+        pose = KernelLaunch(
+            kernels.pose_primitives, given, [tables.shapes, bounds, cluster_bounds, tables.looks], **shape
+        )
 
         tiles = -(-views.width // int(kernels.TILE_WIDTH)) * -(-views.height // int(kernels.TILE_HEIGHT))
         pixels = int(kernels.TILE_PIXELS)
@@ -221,7 +232,7 @@ class WorldCameras:
         shape = {"threads": worlds.count * cameras, "width": max(tiles * pixels // run, 2), "block": _BLOCKS[1]}
         ground = first.primitives.ground
         ground.residual = ground.residual.to(self._device)
-        given = [tables.shapes, tables.clusters, tables.variants, views, ground, tables.label]
+        given = [tables.shapes, tables.clusters, tables.variants, views, ground, tables.looks.label]
         given += [label(Organ.GROUND, 0), motion, self._due, worlds.faults, bounds, cluster_bounds, float("inf"), run]
         draw = KernelLaunch(kernels.draw_pictures, given, [self._primitive, self.depth, self.labels], **shape)
         launches = {"kinematics": move, "pose": pose, "draw": draw}
@@ -248,7 +259,8 @@ class WorldCameras:
         for name in _COPIED:
             value = getattr(given, name)
             setattr(made, name, value.to(self._device) if isinstance(value, wp.array) else value)
-        made.material, made.tint, made.sky = self._tables.material, self._tables.tint, self._tables.sky
+        for name in ("material", "tint", "sky"):
+            setattr(made, name, getattr(self._tables.looks, name))
         made.ground_sky = self._array(np.ones((2, 2), np.float32), float)
         made.ground_x = made.ground_y = -0.5 * _OPEN
         made.ground_cell = _OPEN
@@ -258,8 +270,11 @@ class WorldCameras:
 class _Variant:
     """Primitives of a world, with how each one moves."""
 
-    def __init__(self, model: Model, visuals: tuple[RigidVisual, ...], bodies: np.ndarray, grass: float) -> None:
-        """``visuals``, ``bodies``: visible rigid bodies and the MuJoCo body of each."""
+    def __init__(
+        self, model: Model, visuals: tuple[RigidVisual, ...], bodies: np.ndarray, grass: float, *, canes: bool
+    ) -> None:
+        """``visuals``, ``bodies``: visible rigid bodies and the MuJoCo body of each; ``canes``: whether canes may be
+        cut."""
         self.primitives = scene = Primitives(model, grass=grass)
         scene.update(rest_snapshot(model, visuals, np.tile(frames.pose(np.zeros(3)), (len(visuals), 1))))
         columns = scene.local_columns(np.arange(scene.count))
@@ -291,11 +306,33 @@ class _Variant:
         self.columns["body"][is_rigid] = bodies[carrier[is_rigid] - scene.static_carrier - 1]
         still = ~moves & ~is_rigid
         self.columns["offset"][still] = scene.carrier_poses(np.flatnonzero(still))
+        self.columns |= {"place": np.zeros(scene.count), "first_wood": np.zeros(scene.count, np.int32)}
+        self.wood = np.full(len(model.body_mass), -1)
+        """[body] Number of the segment that is drawn for each body of a cane, -1 for none."""
+        if canes:
+            self._let_canes_be_cut(model, np.flatnonzero(moves), body)
         of_bunch = np.flatnonzero(role == kernels.BUNCH)
         rest = model_rest(model)
         own = rest[model.bunch_body[bunch[of_bunch]]]
         self.columns["offset"][of_bunch] = frames.compose(frames.inverse(own), rest[body[of_bunch]])
         self._add_pieces(np.flatnonzero(is_stalk))
+
+    def _let_canes_be_cut(self, model: Model, rows: np.ndarray, body: np.ndarray) -> None:
+        """Give the primitives of canes and of spare bodies their roles. ``rows`` [k]: what plants carry; ``body``: body
+        of each primitive."""
+        is_cane = model.body_organ == int(Organ.CANE)
+        is_cane[model.leaf_body] = False
+        is_spare = model.is_spare()
+        rows = rows[(is_cane | is_spare)[body[rows]]]
+        place = self.primitives.growth_places(rows)
+        is_wood = np.isnan(place)
+        self.columns["role"][rows] = np.where(is_wood, int(kernels.WOOD), int(kernels.GROWN))
+        self.columns["place"][rows] = np.where(is_wood, 0.0, place)
+        stumps = rows[is_spare[body[rows]]]
+        self.columns["role"][stumps] = int(kernels.STUMP)
+        self.columns["first_wood"][stumps] = model.tree_first[model.body_tree[body[stumps]]]
+        wood = rows[is_wood]
+        self.wood[body[wood]] = wood
 
     def _add_pieces(self, stalks: np.ndarray) -> None:
         """Append the parts of stalks that bunches take along, one cluster for each bunch."""
@@ -341,6 +378,12 @@ def bunches_of_worlds(model: Model, count: int) -> np.ndarray:
     return found
 
 
+def _spares_for_cuts(worlds: Worlds) -> int:
+    """Returns the number of spare bodies of each tree that cuts can take; 0 if nothing is cut."""
+    spares = worlds.model.tree_spares
+    return 0 if worlds.pool is None or not len(spares) else int(spares.min())
+
+
 def _variants(worlds: Worlds, grass: float) -> tuple[list[_Variant], np.ndarray]:
     """Returns the different worlds, and the number of each world's variant [world]."""
     rigid = worlds.bodies.rigid
@@ -349,6 +392,7 @@ def _variants(worlds: Worlds, grass: float) -> tuple[list[_Variant], np.ndarray]
     bodies = rigid.visual_bodies()[shown]
     trees = np.arange(len(worlds.model.tree_first) // worlds.count) * worlds.count
     items = items_of_trees(worlds.model)
+    canes = _spares_for_cuts(worlds) > 0
     known: dict[str, int] = {}
     variants = []
     of_world = np.zeros(worlds.count, np.int32)
@@ -357,7 +401,7 @@ def _variants(worlds: Worlds, grass: float) -> tuple[list[_Variant], np.ndarray]
         digest = model.digest()
         if digest not in known:
             known[digest] = len(variants)
-            variants.append(_Variant(model, visuals, bodies, grass))
+            variants.append(_Variant(model, visuals, bodies, grass, canes=canes))
         of_world[world] = known[digest]
     return variants, of_world
 
@@ -382,6 +426,11 @@ class _Tables:
         for name in ("role", "tree", "body", "bunch", "above"):
             setattr(table, name, on_device(joined(name), wp.int32))
         table.offset = on_device(joined("offset"), wp.transform)
+        table.place = on_device(joined("place"), float)
+        bodies = np.cumsum([0, *(len(variant.wood) for variant in variants[:-1])])
+        first_wood = [variant.columns["first_wood"] + start for variant, start in zip(variants, bodies, strict=True)]
+        table.first_wood = on_device(np.concatenate(first_wood), wp.int32)
+        table.wood = on_device(np.concatenate([variant.wood for variant in variants]), wp.int32)
         self.clusters_room = max(2, *(len(variant.first) for variant in variants))
         """Number of clusters of the largest variant, at least two: a launch with a width of 1 has one dimension."""
         self.clusters = Clusters()
@@ -403,15 +452,14 @@ class _Tables:
         self.local.kind = on_device(joined("kind"), wp.int32)
         # of each world, because the kernels of cameras know one number of a primitive
         row = np.minimum(ends[of_world][:, None] + np.arange(table.room), ends[of_world + 1][:, None] - 1).ravel()
-        self.shapes.kind, self.material, self.label = (
-            on_device(joined(name)[row], wp.int32) for name in ("kind", "material", "label")
-        )
-        self.tint = on_device(joined("tint")[row], wp.vec3)
-        self.sky = on_device(joined("sky")[row], float)
+        self.shapes.kind = on_device(joined("kind")[row], wp.int32)
+        self.looks = kernels.Looks()
+        for name, dtype in _LOOKS.items():
+            setattr(self.looks, name, on_device(joined(name)[row], dtype))
         self.bounds: list[wp.array] = []
         """Bounds of primitives and clusters in the pictures."""
 
     def of_worlds(self) -> list[wp.array]:
         """Returns the arrays that grow with the number of worlds."""
         shapes = [getattr(self.shapes, name) for name in ("a", "b", "c", "d", "kind")]
-        return [*shapes, self.material, self.label, self.tint, self.sky, *self.bounds]
+        return [*shapes, *(getattr(self.looks, name) for name in _LOOKS), *self.bounds]

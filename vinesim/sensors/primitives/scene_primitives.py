@@ -382,7 +382,7 @@ class Primitives:
         rows = np.flatnonzero(np.isin(carrier, cuts[:, :2].astype(int)))
         whole = {name: self._columns[name].numpy()[rows] for name in _CUT_COLUMNS}
         drawn = {name: values.copy() for name, values in whole.items()}
-        base = self._growth_places(rows, whole)
+        base = self.growth_places(rows, whole)
         for segment in np.unique(cuts[:, 1]).astype(int).tolist():
             stumps = cuts[cuts[:, 1] == segment]
             stumps = stumps[np.argsort(stumps[:, 2])]
@@ -445,10 +445,12 @@ class Primitives:
         self._know([*self._leaves_before])
         return np.unique(model.body_tree[model.leaf_body[changed]])
 
-    def _growth_places(self, rows: np.ndarray, columns: dict[str, np.ndarray]) -> np.ndarray:
+    def growth_places(self, rows: np.ndarray, columns: dict[str, np.ndarray] | None = None) -> np.ndarray:
         """Returns where the primitives ``rows`` [k] of plants grow along the bodies that carry them [k] m; NaN for the
-        wood of the bodies themselves. ``columns``: columns of these primitives."""
+        wood of the bodies themselves. ``columns``: columns of these primitives; None: the present ones."""
         model = self.model
+        if columns is None:
+            columns = {name: self._columns[name].numpy()[rows] for name in ("local_a", "local_b", "carrier")}
         start, end = columns["local_a"], columns["local_b"]
         carrier = columns["carrier"]
         place = start[:, 0].astype(float)
