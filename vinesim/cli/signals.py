@@ -7,7 +7,7 @@ import threading
 
 
 class Interrupts:
-    """Context in which Ctrl-C raises :class:`KeyboardInterrupt`. Python drops an exception that is raised in ``__del__``
+    """Context in which Ctrl-C raises :class:`KeyboardInterrupt`. Python drops exceptions that are raised in ``__del__``
     of an object; :meth:`check` raises it again."""
 
     def __init__(self) -> None:
