@@ -108,8 +108,9 @@ class Pilot:
 class PolicyTask(Task):
     """Task of a client's robot: do what a policy says. It fails after as long as an episode.
 
-    The servos of a client's robot damp the speed relative to that of their set-points, those of a batch the speed
-    itself. Both exert equal efforts if the set-point follows the target with the time constant damping / stiffness.
+    A servo of a client's robot damps the speed of its joint minus that of its set-point. A servo of a batch damps the
+    speed of its joint. Both exert equal efforts if the set-point follows the target with the time constant damping /
+    stiffness.
 
     Args:
         physics: a world with the plants of the task.

@@ -43,7 +43,7 @@ PARKING_HEIGHT = 100.0
 CAPSULE_ARRAYS = ("body", "local_start", "local_end", "rest_start", "rest_end", "radius", "material", "extent")
 """Arrays of capsules that cuts change."""
 SPARE = 1e-3
-"""[m] Size of shapes that a bunch has not, inside its first sphere."""
+"""[m] Size of unused shapes of a pool body. They lie inside its first sphere, so nothing touches them."""
 
 
 class BunchPool:

@@ -86,8 +86,8 @@ class CaneCuts:
         return [KernelLaunch(kernels.part_canes, [self._numbers(), breaks], written, threads=self._worlds)]
 
     def slow_lying_parts(self) -> list[KernelLaunch]:
-        """Returns the launches that let what was cut off and lies rock no longer than in a client, after the
-        integration of each step."""
+        """Returns the launches that damp the rocking of cut pieces that lie on something, as a client does, after
+        the integration of each step."""
         if not self.cuts:
             return []
         arrays = self._plants.launches.resident_arrays

@@ -60,7 +60,7 @@ def joined(models: Sequence[Model]) -> Model:
 
 
 Items = dict[str, tuple[np.ndarray, np.ndarray]]
-"""By kind: items of a model in the order of their trees, and the first one of each tree in this order [tree + 1]."""
+"""For each kind: indices of the items, sorted by tree, and where the items of each tree begin in them [tree + 1]."""
 
 
 def items_of_trees(model: Model) -> Items:

@@ -27,7 +27,7 @@ from vinesim.worlds.errors import MissingExtra
 DEFAULT_CONTACTS = 16
 """Default for the number of contacts between rigid bodies for which there is room, per world."""
 BUNCH_CONTACTS = 12
-"""The same for each body of a pool for free bunches: as many as it has shapes."""
+"""Further contacts for each body of a pool for free bunches: one for each of its shapes."""
 ROWS_PER_CONTACT = 6
 """Room for rows of constraints per contact; MuJoCo's contacts have 1, 3, 4 or 6 rows."""
 
