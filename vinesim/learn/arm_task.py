@@ -50,7 +50,7 @@ class ArmTask(abc.ABC):
     noise: ClassVar[float] = 1.0
     """Standard deviation of the actions that a training first explores."""
     calm: ClassVar[float] = math.inf
-    """Number of iterations in which this deviation falls to 1/e of what it was, or below."""
+    """Number of iterations of a training after which the largest allowed deviation is 1/e of :attr:`noise`."""
     on_way: ClassVar[float] = 0.0
     """Share of the episodes of a training that begin on the way to :meth:`goals`."""
 

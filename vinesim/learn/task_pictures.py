@@ -13,7 +13,8 @@ from vinesim.sensors.camera.world_cameras import WorldCamera, WorldCameras
 from vinesim.worlds.worlds import Worlds
 
 FARTHEST = 10.0
-"""[m] Depth of what is farther away, and of the sky: observations are finite."""
+"""[m] Largest depth of an observation. The sky and things farther away have this depth, so that observations are
+finite."""
 SPECTATOR_SIZE = (256, 256)
 """[px] Width and height of the pictures of ``render``."""
 
