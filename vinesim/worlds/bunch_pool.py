@@ -120,8 +120,8 @@ class BunchPool:
             breaking = [*self.overload.find(cuts, self.is_free), move, detach, *part]
         ending = [*self.canes.slow_lying_parts(), *breaking]
         self.end_step = KernelGraph(*ending, device=str(self._device)) if ending else None
-        """Launches the kernels that damp lying pieces and break overloaded wood, after the integration of each step; None
-        if there are none."""
+        """Launches the kernels that damp lying pieces and break overloaded wood, after the integration of each step.
+        None: there are none."""
 
     def _zeros(self, dtype: Any, *shape: int) -> wp.array:
         return wp.zeros(shape, dtype=dtype, device=self._device)
