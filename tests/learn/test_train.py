@@ -19,6 +19,7 @@ from tests.support.waiting import deadline
 from vinesim.cli.train import run_evaluation, run_training
 from vinesim.core.errors import UsageError
 from vinesim.learn.policy import Policy, load_policy
+from vinesim.learn.train import Rank
 
 TIMEOUT = deadline(300.0)
 """Limit for a command [s]; reached only by a failure."""
@@ -168,3 +169,10 @@ def test_ctrl_c_keeps_what_was_learned(tmp_path: pathlib.Path) -> None:
     assert load_policy(tmp_path / "policy.npz").task == "reach"
     assert len((tmp_path / "curve.csv").read_text().splitlines()) >= 2
     assert json.loads((tmp_path / "summary.json").read_text())["iterations"] >= 1
+
+
+def test_a_process_of_torchrun_knows_its_place(monkeypatch):
+    assert Rank.of_environment() == Rank(number=0, count=1, gpu=0)
+    for name, value in (("RANK", "3"), ("WORLD_SIZE", "4"), ("LOCAL_RANK", "1")):
+        monkeypatch.setenv(name, value)
+    assert Rank.of_environment() == Rank(number=3, count=4, gpu=1)

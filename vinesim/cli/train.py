@@ -44,7 +44,7 @@ def run_training(
         raise UsageError("--full-physics without --evaluate FILE: a training runs in batches")
     _check(task, device)
     from vinesim.learn.evaluate import evaluate
-    from vinesim.learn.train import Training, require_libraries
+    from vinesim.learn.train import Rank, Training, require_libraries
     from vinesim.learn.variation import Variation
 
     require_libraries()
@@ -52,10 +52,13 @@ def run_training(
     ranges = variation or Variation()
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
+    is_first = Rank.of_environment().number == 0  # the others only train
     note = "; the first start on a GPU compiles kernels for some minutes" if device != "cpu" else ""
-    print(f"making {count} worlds{note}", file=sys.stderr, flush=True)
+    if is_first:
+        print(f"making {count} worlds{note}", file=sys.stderr, flush=True)
     training = Training(task, count, device=device, seed=seed, variation=ranges)
-    training.save(out)  # a place that cannot be written is refused before the training
+    if is_first:
+        training.save(out)  # a place that cannot be written is refused before the training
     limit = math.inf if minutes is None else 60.0 * minutes
     saved = time.monotonic()
     interrupted = False
@@ -63,14 +66,17 @@ def run_training(
         with Interrupts() as interrupts, ProgressLine() as line:
             for done in training.iterations(iterations):
                 interrupts.check()
-                line.show(_progress(done, iterations, limit))
-                if time.monotonic() - saved > SAVE_PERIOD:
+                if is_first:
+                    line.show(_progress(done, iterations, limit))
+                if is_first and time.monotonic() - saved > SAVE_PERIOD:
                     training.save(out)
                     saved = time.monotonic()
-                if done.seconds > limit:
+                if training.any_process(done.seconds > limit):
                     break
     except KeyboardInterrupt:
         interrupted = True
+    if not is_first:
+        return 130 if interrupted else 0
     training.save(out)
     if training.curve:
         last = training.curve[-1]

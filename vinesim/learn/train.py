@@ -9,6 +9,7 @@ import importlib.metadata
 import io
 import json
 import math
+import os
 import pathlib
 import time
 from collections.abc import Iterator
@@ -16,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from vinesim.core.errors import writing
+from vinesim.core.errors import UsageError, writing
 from vinesim.core.version import __version__
-from vinesim.learn.evaluate import environment
+from vinesim.learn.evaluate import UNSEEN, environment
 from vinesim.learn.policy import Policy
 from vinesim.learn.variation import Variation
 from vinesim.sensors.export.files import write_files
@@ -28,6 +29,8 @@ HIDDEN = (256, 128, 64)
 """Widths of the hidden layers of the policy and of the value function."""
 ACTIONS = 32
 """Number of actions in each world between two updates of the policy."""
+SEEDS_APART = 1_000_003
+"""Difference between the seeds of the vines of two processes."""
 LEAST_NOISE = 0.15
 """Deviation of the explored actions above which it may be limited. GUESSED: it moves a hand by less than 0.1 m/s."""
 VINES = 256
@@ -51,6 +54,24 @@ PPO: dict[str, Any] = {
     "max_grad_norm": 1.0,
 }
 """Configuration of rsl_rl's PPO, without the discount, which a task has. TUNED on the tasks reach and pick."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Rank:
+    """This process among those that ``torchrun`` starts, which train one policy together, each on a GPU of its own."""
+
+    number: int
+    """From 0 on, on all machines."""
+    count: int
+    """Number of processes; 1 without ``torchrun``."""
+    gpu: int
+    """Number of the process's GPU on its machine."""
+
+    @staticmethod
+    def of_environment() -> Rank:
+        """Returns what the variables ``RANK``, ``WORLD_SIZE`` and ``LOCAL_RANK`` say."""
+        number, count, gpu = (int(os.environ.get(name, "0")) for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK"))
+        return Rank(number, max(count, 1), gpu)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,10 +103,12 @@ def require_libraries() -> None:
 class Training:
     """A training of a task. :meth:`iterations` trains; :meth:`policy` and :meth:`save` give what was learned so far.
 
+    Processes of ``torchrun`` train one policy with different vines. rsl_rl averages their gradients.
+
     Args:
         task: name of the task, one of :data:`vinesim.learn.TASKS`.
-        worlds: number of worlds.
-        device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
+        worlds: number of worlds of this process.
+        device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``; with several processes ``"cuda"``, of which each takes its GPU.
         seed: seed of vines, wanted bunches, weights and explored actions, below
             :data:`~vinesim.learn.evaluate.UNSEEN`.
         variation: ranges of the numbers in which worlds differ, or a TOML file with them.
@@ -110,9 +133,16 @@ class Training:
         from vinesim.learn.rsl import RslEnv
 
         self.task = task
+        self.rank = rank = Rank.of_environment()
+        """This process."""
+        if rank.count > 1:
+            if device != "cuda":
+                raise UsageError(f"device {device!r} with {rank.count} processes: give 'cuda', each takes its own GPU")
+            device = f"cuda:{rank.gpu}"
         self.curve: list[Progress] = []
+        """Progress of the worlds of this process; actions are those of all."""
         self._origin = {"task": task, "seed": seed, "worlds": worlds, "vinesim": __version__}
-        torch.manual_seed(seed)
+        torch.manual_seed(seed + rank.number)
         if device == "cpu":
             # the networks are small, and threads that wait for each other slow down the worlds: on two busy cores a
             # training took 240 actions/s with them and 2,390 without
@@ -120,9 +150,15 @@ class Training:
         make = environment(task)
         share = make.task_class.on_way
         env = make(
-            worlds, device=device, arrays="torch", vines_seed=seed, vines=VINES, variation=variation, on_way=share
-        )  # fmt: skip
-        env.reset(seed=seed)
+            worlds,
+            device=device,
+            arrays="torch",
+            vines_seed=(seed + rank.number * SEEDS_APART) % UNSEEN,
+            vines=VINES,
+            variation=variation,
+            on_way=share,
+        )
+        env.reset(seed=seed + rank.number)
         env.step(torch.zeros(env.num_envs, env.num_actions, device=device))  # the first step compiles the kernels
         self._env = RslEnv(env)
         self._noise = env.task_class.noise
@@ -152,19 +188,30 @@ class Training:
         begin = time.monotonic()
         for i in range(count):
             self._limit_noise(self._noise * math.exp(-i / self._calm))
-            self._runner.learn(1, init_at_random_ep_len=i == 0)
+            with contextlib.redirect_stdout(io.StringIO()):  # several processes print that they synchronise
+                self._runner.learn(1, init_at_random_ep_len=i == 0)
             total = self._env.take_totals()
             actions = self._env.num_envs * ACTIONS
             done = Progress(
                 iteration=i + 1,
                 seconds=time.monotonic() - begin,
-                actions=actions * (i + 1),
+                actions=actions * (i + 1) * self.rank.count,
                 mean_reward=total.reward / actions,
                 success=total.success / total.ended if total.ended else float("nan"),
                 faults=total.fault,
             )
             self.curve.append(done)
             yield done
+
+    def any_process(self, is_so: bool) -> bool:
+        """Returns whether ``is_so`` in any process. All processes must call this; without ``torchrun`` there is one."""
+        if self.rank.count == 1:
+            return is_so
+        import torch  # pyright: ignore[reportMissingImports]
+
+        flag = torch.tensor(float(is_so), device=self._env.device)
+        torch.distributed.all_reduce(flag, torch.distributed.ReduceOp.MAX)
+        return bool(flag.item())
 
     def _limit_noise(self, largest: float) -> None:
         """Limit the deviation of the explored actions to ``largest``, but not below :data:`LEAST_NOISE`."""
@@ -199,6 +246,7 @@ class Training:
             lines.append(",".join(map(str, (*row, share, done.faults))))
         last = self.curve[-1] if self.curve else None
         summary = self._origin | {
+            "processes": self.rank.count,
             "device": self._device,
             "libraries": {name: importlib.metadata.version(name) for name in LIBRARIES},
             "iterations": 0 if last is None else last.iteration,
