@@ -47,6 +47,9 @@ class ArmTask(abc.ABC):
     discount: ClassVar[float] = 0.98
     """Discount of an action for which the rewards are made. TUNED on the task reach."""
 
+    learning_rate: ClassVar[float | None] = None
+    """Learning rate of a training; None: it is adapted. With 64 worlds and 7.5 minutes on a core, Reach was done on
+    98.8 % of unseen vines with an adapted rate, and on 94.8 % with 3e-4."""
     noise: ClassVar[float] = 1.0
     """Standard deviation of the actions that a training first explores."""
     calm: ClassVar[float] = math.inf

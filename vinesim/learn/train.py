@@ -39,10 +39,6 @@ LIBRARIES = ("torch", "rsl-rl-lib", "warp-lang", "mujoco-warp")
 """Packages whose versions are kept with a training."""
 PPO: dict[str, Any] = {
     "class_name": "PPO",
-    # that of Stable-Baselines3. rsl_rl's adaptive rate, which the value function shares, fell to its least value of
-    # 1e-5 within two iterations of 64 worlds: the gradients of small batches differ so much
-    "learning_rate": 3e-4,
-    "schedule": "fixed",
     "lam": 0.95,
     "entropy_coef": 0.002,
     "num_learning_epochs": 5,
@@ -53,7 +49,9 @@ PPO: dict[str, Any] = {
     "value_loss_coef": 1.0,
     "max_grad_norm": 1.0,
 }
-"""Configuration of rsl_rl's PPO, without the discount, which a task has. TUNED on the tasks reach and pick."""
+"""Configuration of rsl_rl's PPO, without discount and learning rate, which a task has. TUNED on the task reach."""
+ADAPTIVE = {"learning_rate": 1e-3, "schedule": "adaptive", "desired_kl": 0.01}
+"""The learning rate that rsl_rl adapts to how much each update changes the policy. TUNED on the task reach."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,6 +96,10 @@ def require_libraries() -> None:
         importlib.import_module("rsl_rl.runners")
     except ImportError as error:
         raise MissingExtra(f"training needs PyTorch and rsl_rl: pip install 'vinesim[train]' ({error})") from error
+
+
+def _learning_rate(fixed: float | None) -> dict[str, Any]:
+    return ADAPTIVE if fixed is None else {"learning_rate": fixed, "schedule": "fixed"}
 
 
 class Training:
@@ -178,7 +180,7 @@ class Training:
             "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
             "actor": network | {"distribution_cfg": actions},
             "critic": network,
-            "algorithm": PPO | {"gamma": env.task_class.discount},
+            "algorithm": PPO | {"gamma": env.task_class.discount} | _learning_rate(env.task_class.learning_rate),
         }
         with contextlib.redirect_stdout(io.StringIO()):  # it prints its networks
             self._runner = OnPolicyRunner(self._env, config, log_dir=None, device=device)
