@@ -143,7 +143,7 @@ def test_an_evaluation_says_what_does_not_fit() -> None:
         evaluate_with_full_physics(wrong, 1, variation=Variation(delay=(0, 2)))
 
 
-@pytest.mark.parametrize("controller", [Reaching, Picking])
+@pytest.mark.parametrize("controller", [Reaching, Picking, Pruning])
 def test_the_arm_of_a_client_follows_a_policy_like_that_of_the_physics(controller: type[Controller]) -> None:
     """The client's robot has servos of its own, which follow the speed of their set-points."""
     policy = controller()

@@ -47,6 +47,9 @@ class ArmTask(abc.ABC):
     discount: ClassVar[float] = 0.98
     """Discount of an action for which the rewards are made. TUNED on the task reach."""
 
+    failure: ClassVar[str] = "it can no longer be done"
+    """What has happened when success is no longer possible."""
+
     learning_rate: ClassVar[float | None] = None
     """Learning rate of a training; None: it is adapted. With 64 worlds and 7.5 minutes on a core, Reach was done on
     98.8 % of unseen vines with an adapted rate, and on 94.8 % with 3e-4."""
@@ -78,6 +81,11 @@ class ArmTask(abc.ABC):
     def blade() -> Blade | None:
         """Returns the robot's blade, if it has one."""
         return None
+
+    @staticmethod
+    def wanted_body(model: Model, wanted: int) -> int:
+        """Returns the body of a world's plants that the task is about. ``wanted``: number of the wanted tree."""
+        return int(model.bunch_body[wanted])
 
     @classmethod
     def goals(cls, model: Model) -> np.ndarray:

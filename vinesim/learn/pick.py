@@ -82,6 +82,7 @@ class Pick(ArmTask):
     actions = len(AXES) + 2
     max_steps = 150
     choices = SHOOTS
+    failure = "the wanted bunch is lost, or another one came off"
     learning_rate = 3e-4
     """That of Stable-Baselines3. With 64 worlds an adapted rate fell to its least value of 1e-5 within two iterations:
     the gradients of small batches differ so much."""

@@ -45,6 +45,8 @@ class Pilot:
         self._wanted = wanted
         self.name = task.name
         """Name of the task."""
+        self.failure = task.failure
+        """What has happened if :attr:`failed`."""
         self._task = task(arrays)
         self._task.wanted.fill_(wanted)
         observation, action = (wp.zeros((1, size), dtype=float, device="cpu") for size in (task.numbers, task.actions))
@@ -75,11 +77,11 @@ class Pilot:
         return bool(self._failed[0])
 
     def focus(self) -> np.ndarray:
-        """Returns where the wanted bunch is [3] m."""
+        """Returns where the wanted bunch or internode is [3] m."""
         rigid = self._physics.rigid
         if self._wanted in rigid.free_bunches:
             return rigid.bunch_pose(self._wanted)[:3]
-        return self._physics.state.body_q[self._physics.model.bunch_body[self._wanted], :3]
+        return self._physics.state.body_q[self._task.wanted_body(self._physics.model, self._wanted), :3]
 
     def targets(self) -> Iterator[np.ndarray]:
         """Yields, before each step of the physics, the targets [joint] rad or m of the servos, and closes the blade.
@@ -128,7 +130,7 @@ class PolicyTask(Task):
         super().__init__(robot, timeout=task.max_steps * STEPS * physics.dt)
 
     def focus(self) -> np.ndarray:
-        """Returns where the wanted bunch is [3] m."""
+        """Returns where the wanted bunch or internode is [3] m."""
         return self._pilot.focus()
 
     def run(self) -> Iterator[str]:
@@ -139,7 +141,7 @@ class PolicyTask(Task):
             self.robot.command_position(setpoint)
             yield self._pilot.name
         if self._pilot.failed:
-            raise TaskFailed("the wanted bunch is lost, or another one came off")
+            raise TaskFailed(self._pilot.failure)
         if not self._pilot.succeeded:
             raise TaskFailed(f"not done after {self.timeout:g} s")
 

@@ -54,6 +54,7 @@ class Prune(ArmTask):
     numbers = 2 * len(AXES) + 6 + 3 * (CANES - 1) + 2 + CANES
     actions = len(AXES) + 1
     choices = CANES
+    failure = "a cane was cut elsewhere"
     parameters = PhysicsParameters(cutting_strength=DORMANT_STRENGTH, cutting_energy_share=DORMANT_ENERGY_SHARE)
 
     def __init__(self, arrays: ArmArrays) -> None:
@@ -64,6 +65,11 @@ class Prune(ArmTask):
     def plants(rng: np.random.Generator, variation: Variation) -> Model:
         """Returns two canes."""
         return canes(rng, variation)
+
+    @staticmethod
+    def wanted_body(model: Model, wanted: int) -> int:
+        """Returns the internode that shall be cut."""
+        return int(model.tree_first[wanted]) + KEPT
 
     @staticmethod
     def blade() -> Blade | None:
