@@ -212,15 +212,18 @@ class RosWorker(Worker):
         """Returns the next step record to publish. None if no record comes for a while, or subscribers are behind."""
         steps = self.channel.steps
         wanted = self.channel.wanted
+        if not steps.wait(POLL_PERIOD):
+            wanted["waits"][0] = False
+            return None
         begin = time.monotonic()
-        while steps.waiting_count and self.node.must_wait(now := time.monotonic()):
+        while self.node.must_wait(now := time.monotonic()):  # before each record, also if none has piled up
             wanted["waits"][0] = True
             if now - begin > POLL_PERIOD:
                 return None
             time.sleep(WAIT_PERIOD)
         wanted["waits"][0] = False
         time.sleep(self._pace.delay(steps.put_count))
-        if (record := steps.take(POLL_PERIOD)) is not None:
+        if (record := steps.take(0.0)) is not None:
             self._pace.add()
         return record
 

@@ -193,6 +193,13 @@ class SharedQueue:
             self._unannounced -= 1
             self._filled.release()
 
+    def wait(self, timeout: float) -> bool:
+        """Returns whether there is a record, after waiting up to ``timeout`` [s] for one."""
+        if not self._filled.acquire(timeout=timeout):
+            return False
+        self._filled.release()
+        return True
+
     def take(self, timeout: float) -> Any | None:
         """Remove the oldest record. Returns a copy of it, or None if there is no record within ``timeout`` [s]."""
         if not self._filled.acquire(timeout=timeout):
