@@ -1,5 +1,6 @@
 """Controllers of the arm of the learning tasks that know its kinematics."""
 
+import abc
 import functools
 from typing import Any
 
@@ -39,7 +40,7 @@ def towards(env: Any, ways: np.ndarray, gain: float = GAIN, ahead: np.ndarray | 
     return np.clip(gain * np.array(steps), -1.0, 1.0).astype(np.float32)
 
 
-class Controller:
+class Controller(abc.ABC):
     """A stand-in for a policy of a task that computes actions from observations and the kinematics of the arm."""
 
     def __init__(self, task: type[ArmTask]) -> None:
@@ -55,8 +56,9 @@ class Controller:
             return np.array([self(one) for one in observation])
         return np.clip(self._act(observation.astype(float)), -1.0, 1.0).astype(np.float32)
 
+    @abc.abstractmethod
     def _act(self, observation: np.ndarray) -> np.ndarray:
-        raise NotImplementedError
+        """Returns the action that follows from an observation."""
 
 
 class Reaching(Controller):
