@@ -22,8 +22,9 @@ import warp as wp
 
 from benchmarks.worlds import card, seconds_a_step
 from vinesim.learn.arm import arm
-from vinesim.learn.arm_env import BASE, CAMERAS, HOME, VARIANTS
-from vinesim.learn.reach import plants
+from vinesim.learn.arm_env import CAMERAS, VARIANTS
+from vinesim.learn.arm_task import BASE, HOME
+from vinesim.learn.reach import Reach
 from vinesim.learn.variation import Variation
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
@@ -40,7 +41,7 @@ TREES = 8
 def batch(scene: str, count: int, device: str) -> tuple[Worlds, np.ndarray]:
     """Returns ``count`` worlds, and the point [3] m that the fixed camera looks at."""
     if scene == "shoots":
-        models = [plants(np.random.default_rng([0, k]), Variation()) for k in range(min(count, VARIANTS))]
+        models = [Reach.plants(np.random.default_rng([0, k]), Variation()) for k in range(min(count, VARIANTS))]
         middle = np.array([1.0, 0.0, 0.75])
         base = BASE
     else:
