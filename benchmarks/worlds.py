@@ -81,11 +81,13 @@ def seconds_a_step(launch: Any, steps: int, device: str) -> float:
     return (time.perf_counter() - begin) / steps
 
 
-def ours(count: int, device: str, steps: int, canes: int, *, touched: bool, settle: int) -> dict[str, object]:
+def ours(
+    count: int, device: str, steps: int, canes: int, *, touched: bool, settle: int, deterministic: bool = False
+) -> dict[str, object]:
     """Returns the measurement of :class:`Worlds`: while the canes fall and swing, and again after ``settle`` steps."""
     began = time.perf_counter()
     model = plants_of_worlds([plants(canes, touched=touched)], count)
-    worlds = Worlds(model, count, robots=[arm(BASE)], device=device)
+    worlds = Worlds(model, count, robots=[arm(BASE)], device=device, deterministic=deterministic)
     worlds.step(1)
     wp.synchronize_device(device)
     started = time.perf_counter() - began
@@ -98,6 +100,7 @@ def ours(count: int, device: str, steps: int, canes: int, *, touched: bool, sett
     row: dict[str, object] = {
         "case": "vinesim",
         "touched": touched,
+        "deterministic": deterministic,
         "worlds": count,
         "canes": canes,
         "ms": round(1e3 * took, 3),
@@ -210,17 +213,22 @@ def main() -> None:
     parser.add_argument("--settle", type=int, default=3000, help="steps after which the canes hang still")
     parser.add_argument("--single", type=int, default=0, help="also this many worlds of one cane")
     parser.add_argument("--no-peer", action="store_true")
+    parser.add_argument("--deterministic", action="store_true", help="ours: equal worlds stay equal to the bit")
     options = parser.parse_args()
     wp.config.quiet = True
     on = card(options.device)
     for count in options.worlds:
         for touched in (False, True):
-            print(
-                json.dumps(
-                    on | ours(count, options.device, options.steps, CANES, touched=touched, settle=options.settle)
-                ),
-                flush=True,
+            row = ours(
+                count,
+                options.device,
+                options.steps,
+                CANES,
+                touched=touched,
+                settle=options.settle,
+                deterministic=options.deterministic,
             )
+            print(json.dumps(on | row), flush=True)
             if not options.no_peer:
                 print(json.dumps(on | peer(count, options.device, options.steps, touched=touched)), flush=True)
     if options.single:

@@ -11,7 +11,7 @@ from collections.abc import Generator, Iterator
 import hypothesis
 import pytest
 
-from tests.support import orphans
+from tests.support import layouts, orphans
 
 if "PYTEST_XDIST_WORKER" in os.environ or "ROS_DOMAIN_ID" not in os.environ:
     # also in a worker, which inherits the domain of the process that started it
@@ -62,6 +62,14 @@ def processes_share_their_imports() -> Iterator[None]:
     worker_process.CONTEXT = context
     yield
     multiprocessing.forkserver._forkserver._stop()
+
+
+@pytest.fixture(scope="module", params=layouts.LAYOUTS)
+def layout(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Where the batches of worlds of a file run; see :mod:`tests.support.layouts`."""
+    with pytest.MonkeyPatch.context() as patch:
+        layouts.apply(request.param, patch)
+        yield request.param
 
 
 def _fail_if_skipped(report: pytest.TestReport | pytest.CollectReport) -> None:

@@ -12,14 +12,14 @@ import gymnasium
 
 from tests.learn.arm_control import towards
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("layout")]
 HIDING = slice(17, 20)
 SHARE = 20
 FORCE = 21
 
 
 @pytest.fixture(scope="module")
-def environment() -> Any:
+def environment(layout: str) -> Any:
     return gymnasium.make_vec("vinesim/Expose-v0", num_envs=4)
 
 

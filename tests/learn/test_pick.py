@@ -18,7 +18,7 @@ from vinesim.learn.pick import IN_FRONT, Pick, PickEnv
 from vinesim.learn.variation import Variation
 from vinesim.scene.state import State
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("layout")]
 OPENING = 14
 STALK = slice(15, 18)
 COMMANDED = 21
@@ -28,7 +28,7 @@ BLADE = 8
 
 
 @pytest.fixture(scope="module")
-def environment() -> Any:
+def environment(layout: str) -> Any:
     return gymnasium.make_vec("vinesim/Pick-v0", num_envs=2)
 
 

@@ -19,7 +19,7 @@ from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("layout")]
 PLACE = slice(14, 17)
 ALONG = slice(17, 20)
 APPROACH, ENTER, CUT = range(3)
@@ -27,7 +27,7 @@ APPROACH, ENTER, CUT = range(3)
 
 
 @pytest.fixture(scope="module")
-def environment() -> Any:
+def environment(layout: str) -> Any:
     return gymnasium.make_vec("vinesim/Prune-v0", num_envs=2)
 
 

@@ -19,11 +19,11 @@ from tests.learn.arm_control import towards
 from vinesim.learn.reach import ReachEnv
 from vinesim.learn.variation import Variation
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("layout")]
 
 
 @pytest.fixture(scope="module")
-def environment() -> Any:
+def environment(layout: str) -> Any:
     return gymnasium.make_vec("vinesim/Reach-v0", num_envs=3)
 
 
@@ -105,8 +105,10 @@ def test_a_world_that_explodes_ends_with_its_fault_and_the_others_do_not_notice(
 
 
 def test_arrays_on_the_device_have_the_numbers_of_those_of_numpy_and_are_no_copies():
-    """By DLPack, as PyTorch would take them. The results of an action stay until the action after the next one."""
-    on_host, on_device = (gymnasium.make_vec("vinesim/Reach-v0", num_envs=2, arrays=a) for a in ("numpy", "warp"))
+    """By DLPack, as PyTorch would take them; NumPy takes those of a CPU. The results of an action stay until the action
+    after the next one."""
+    given: dict[str, Any] = {"num_envs": 2, "device": "cpu"}
+    on_host, on_device = (gymnasium.make_vec("vinesim/Reach-v0", arrays=a, **given) for a in ("numpy", "warp"))
     rng = np.random.default_rng(1)
     seen = [env.reset(seed=3)[0] for env in (on_host, on_device)]
     np.testing.assert_array_equal(seen[0], np.from_dlpack(seen[1]))

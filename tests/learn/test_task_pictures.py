@@ -16,13 +16,13 @@ from gymnasium.utils.env_checker import check_env
 from vinesim.learn.task_pictures import FARTHEST
 from vinesim.scene.ids import LABEL_STRIDE, Organ
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("layout")]
 
 SIZE = 32
 
 
 @pytest.fixture(scope="module")
-def environment() -> Any:
+def environment(layout: str) -> Any:
     return gymnasium.make_vec("vinesim/Reach-v0", num_envs=2, observation="pictures", picture_size=SIZE)
 
 
@@ -72,8 +72,10 @@ def test_the_last_pictures_of_an_episode_are_kept_and_the_next_ones_are_those_of
 
 
 def test_arrays_on_the_device_are_no_copies() -> None:
-    env = gymnasium.make_vec("vinesim/Reach-v0", num_envs=2, observation="pictures", picture_size=SIZE, arrays="warp")
-    on_host = gymnasium.make_vec("vinesim/Reach-v0", num_envs=2, observation="pictures", picture_size=SIZE)
+    """NumPy takes those of a CPU."""
+    given: dict[str, Any] = {"num_envs": 2, "observation": "pictures", "picture_size": SIZE, "device": "cpu"}
+    env = gymnasium.make_vec("vinesim/Reach-v0", arrays="warp", **given)
+    on_host = gymnasium.make_vec("vinesim/Reach-v0", **given)
     observation, _ = env.reset(seed=1)
     expected, _ = on_host.reset(seed=1)
     for name, values in observation.items():

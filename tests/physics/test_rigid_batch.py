@@ -38,10 +38,12 @@ def test_joints_at_their_limits_resist_as_in_a_client():
     batch.predict()
     dofs = client.mj_model.nv
     assert batch.data.nefc.numpy().tolist() == [2, 0]
-    inverse = wp.zeros((2 * dofs, dofs), dtype=wp.float64)
+    inverse = wp.zeros((2 * dofs, dofs), dtype=wp.float64, device="cpu")
     contacts = WorldContacts()
-    contacts.count = wp.ones(2, dtype=wp.int32)
-    wp.launch(invert_effective_mass, 2, inputs=[batch.effective_mass(), 2, dofs, contacts], outputs=[inverse])
+    contacts.count = wp.ones(2, dtype=wp.int32, device="cpu")
+    wp.launch(
+        invert_effective_mass, 2, inputs=[batch.effective_mass(), 2, dofs, contacts], outputs=[inverse], device="cpu"
+    )
     limited, free = inverse.numpy().reshape(dofs, dofs, 2).transpose(2, 0, 1)
     response = EffectiveMass(client.mj_model).impulse_response(client.mj_data, np.eye(dofs))
     np.testing.assert_allclose(limited, response, rtol=1e-4, atol=1e-5 * np.abs(response).max())

@@ -15,6 +15,8 @@ pytest.importorskip("mujoco_warp")
 from vinesim.worlds.plants import plants_of_worlds
 from vinesim.worlds.worlds import Worlds
 
+pytestmark = pytest.mark.usefixtures("layout")
+
 PARAMETERS = PhysicsParameters(sleep=False)
 HAND = scenes.gripper("hand", scenes.bunch_center(0))
 
@@ -92,15 +94,14 @@ def put(array: str, world: int, value: float) -> Callable[[Worlds], None]:
         else:
             rows = worlds.plants.launches.resident_arrays[array]
             numbers = rows.numpy()
-            size = len(numbers) // 4
-            numbers[world * size : (world + 1) * size] = value
+            numbers[worlds.plants.buffers.slots[worlds.model.body_tree == world]] = value
         rows.assign(numbers)
 
     return overwrite
 
 
 @pytest.fixture(scope="module")
-def four() -> Worlds:
+def four(layout: str) -> Worlds:
     return Worlds(bunches(4), 4, robots=[HAND], parameters=PARAMETERS)
 
 
@@ -178,6 +179,20 @@ def test_contacts_beyond_the_room_of_one_world_are_its_fault_alone() -> None:
     crowded.reset(np.array([False, True, False, False]))
     crowded.step()
     assert crowded.faults.numpy()[1] == 0, "only a further contact without room is a new fault"
+
+
+@pytest.mark.slow
+def test_no_world_is_listed_twice_for_a_longer_search_if_all_lack_room_for_contacts() -> None:
+    """The list has an entry for each world. All hands close both fingers where there is room for one contact."""
+    worlds = Worlds(bunches(4), 4, robots=[HAND], parameters=PARAMETERS, slots=1)
+    busy = worlds.contacts.lists()[1].busy_count
+    longest = 0
+    for tick in range(40):
+        worlds.bodies.targets.assign(np.array([targets(tick, 0.0)] * 4, np.float32))
+        worlds.step()
+        longest = max(longest, int(busy.numpy()[0]))
+    assert (worlds.dropped > 0).all()
+    assert longest <= 4
 
 
 def test_plants_of_worlds_are_those_of_their_models():

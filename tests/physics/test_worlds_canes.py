@@ -1,18 +1,15 @@
 """Blades in batches of worlds cut canes: stumps and what falls move as in a client, in their own world only."""
 
-from typing import Any
-
 import msgspec
 import numpy as np
 import pytest
 
 from tests.physics.test_worlds import PARAMETERS
 from tests.physics.test_worlds_cutting import client
+from tests.support.layouts import order_bodies_as_a_gpu
 from vinesim.core import frames
 from vinesim.interaction import cutting_force
 from vinesim.interaction.blades import Blade
-from vinesim.plants.articulation_solver import ArticulationSolver
-from vinesim.plants.device_buffers import DeviceBuffers
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.spare_bodies import with_spares
@@ -24,6 +21,8 @@ from vinesim.learn.arm import arm
 from vinesim.learn.shoots import shoots
 from vinesim.worlds.plants import plants_of_worlds
 from vinesim.worlds.worlds import Worlds
+
+pytestmark = pytest.mark.usefixtures("layout")
 
 INERTIA = '<mass value="2"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/>'
 SHEARS = RobotSpec(
@@ -98,10 +97,11 @@ def test_a_shoot_falls_with_its_bunch_and_lies_down_as_in_a_client(seed: int, se
         worlds.step()
         if tick == 0:
             assert cutter.detachments[0].body == segment
-            stump = int(np.flatnonzero(model.is_spare())[0])
+            stump = worlds.plants.buffers.slots[np.flatnonzero(model.is_spare())[0]]
             place_along = worlds.pool.canes.parts[0].end.numpy()[stump]
             assert place_along == pytest.approx(cutter.detachments[0].at, abs=1e-7)
             assert worlds.pool.needed.numpy()[0] == pytest.approx(cutter.resistance, rel=1e-5)
+            worlds.download()
             for name in ("body_mass", "body_com", "body_inertia", "body_product", "body_drag"):
                 ours = getattr(worlds.plants, name)[: len(live)]
                 np.testing.assert_allclose(ours, getattr(physics.plants, name), rtol=1e-5, atol=1e-12)
@@ -141,9 +141,10 @@ def test_pieces_and_stumps_are_cut_again_as_in_a_client() -> None:
     for name in ("body_mass", "body_com", "body_inertia", "joint_stiffness", "_parent", "_root"):
         np.testing.assert_allclose(getattr(worlds.plants, name), getattr(physics.plants, name), rtol=1e-4, atol=1e-9)
     parts = worlds.pool.canes.parts[0]
+    end, start = (one.numpy()[worlds.plants.buffers.slots] for one in (parts.end, parts.start))
     spare = int(model.tree_first[0] + model.tree_core[0] - 3)
-    np.testing.assert_allclose(parts.end.numpy()[spare : spare + 3], [0.1, 0.15, 0.05], atol=1e-3)
-    np.testing.assert_allclose(parts.start.numpy()[[0, spare, spare + 1, spare + 2]], [0.15, 0.05, 0.1, 0.0], atol=1e-3)
+    np.testing.assert_allclose(end[spare : spare + 3], [0.1, 0.15, 0.05], atol=1e-3)
+    np.testing.assert_allclose(start[[0, spare, spare + 1, spare + 2]], [0.15, 0.05, 0.1, 0.0], atol=1e-3)
     assert not worlds.faults.numpy().any()
 
 
@@ -269,8 +270,5 @@ def test_cuts_are_the_same_to_the_bit_in_the_order_of_bodies_on_a_gpu(monkeypatc
 
     expected = moved()
 
-    def interleaved(*given: Any, device: str) -> ArticulationSolver:
-        return ArticulationSolver(*given, buffers=DeviceBuffers(device, 4))
-
-    monkeypatch.setattr("vinesim.worlds.worlds.ArticulationSolver", interleaved)
+    order_bodies_as_a_gpu(monkeypatch, 4)
     np.testing.assert_array_equal(expected, moved())

@@ -1,18 +1,15 @@
 """Blades in batches of worlds: what they cut off moves as in a client, in its own world only."""
 
-from typing import Any
-
 import mujoco
 import numpy as np
 import pytest
 
 from tests.physics.test_worlds import HAND, PARAMETERS, bunches, targets
+from tests.support.layouts import order_bodies_as_a_gpu
 from vinesim.bench import scenes
 from vinesim.core import frames
 from vinesim.interaction import cutting_force
 from vinesim.interaction.blades import Blade
-from vinesim.plants.articulation_solver import ArticulationSolver
-from vinesim.plants.device_buffers import DeviceBuffers
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
@@ -29,6 +26,8 @@ from vinesim.learn.shoots import shoots
 from vinesim.worlds.bunch_pool import OWN
 from vinesim.worlds.plants import plants_of_worlds
 from vinesim.worlds.worlds import Worlds
+
+pytestmark = pytest.mark.usefixtures("layout")
 
 HALF = np.array([0.03, 0.03, 0.002])
 MOUTH = frames.pose(np.array([0.0, 0.0, scenes.BUNCH_CENTER + 0.03]))
@@ -162,12 +161,13 @@ def test_a_swinging_bunch_leaves_with_the_mass_shapes_and_momentum_that_a_client
         np.testing.assert_allclose(found[name][here], getattr(theirs, name)[there], rtol=1e-5, atol=2e-6)
     np.testing.assert_allclose(found["geom_size"][here, :2], theirs.geom_size[there, :2], rtol=1e-5, atol=2e-6)
     np.testing.assert_array_equal(ours.geom_type[here], theirs.geom_type[there])
+    worlds.download()
     for name in ("body_mass", "body_com", "body_inertia", "body_product"):
         np.testing.assert_allclose(getattr(worlds.plants, name), getattr(physics.plants, name), rtol=1e-4, atol=1e-12)
 
 
 @pytest.fixture(scope="module")
-def eight() -> Worlds:
+def eight(layout: str) -> Worlds:
     return Worlds(bunches(8), 8, robots=[HAND], parameters=PARAMETERS, blade=blade())
 
 
@@ -338,10 +338,7 @@ def test_cuts_are_the_same_to_the_bit_in_the_order_of_bodies_on_a_gpu(monkeypatc
 
     expected = moved()
 
-    def interleaved(*given: Any, device: str) -> ArticulationSolver:
-        return ArticulationSolver(*given, buffers=DeviceBuffers(device, 4))
-
-    monkeypatch.setattr("vinesim.worlds.worlds.ArticulationSolver", interleaved)
+    order_bodies_as_a_gpu(monkeypatch, 4)
     for one, other in zip(expected, moved(), strict=True):
         np.testing.assert_array_equal(one, other)
 

@@ -1,14 +1,11 @@
 """Peduncles and canes break under their load in batches of worlds as in a client."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
 from tests.physics.test_worlds import PARAMETERS
 from tests.physics.test_worlds_cutting import pose_in_client, poses_in_batch
-from vinesim.plants.articulation_solver import ArticulationSolver
-from vinesim.plants.device_buffers import DeviceBuffers
+from tests.support.layouts import order_bodies_as_a_gpu
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.world import Physics
@@ -18,6 +15,8 @@ from vinesim.learn.arm import arm
 from vinesim.learn.shoots import shoots
 from vinesim.worlds.plants import plants_of_worlds
 from vinesim.worlds.worlds import Worlds
+
+pytestmark = pytest.mark.usefixtures("layout")
 
 ROBOT = arm((-2.0, 0.0, 0.6))
 
@@ -132,10 +131,7 @@ def test_wood_breaks_the_same_to_the_bit_in_the_order_of_bodies_on_a_gpu(monkeyp
 
     expected = moved()
 
-    def interleaved(*given: Any, device: str) -> ArticulationSolver:
-        return ArticulationSolver(*given, buffers=DeviceBuffers(device, 4))
-
-    monkeypatch.setattr("vinesim.worlds.worlds.ArticulationSolver", interleaved)
+    order_bodies_as_a_gpu(monkeypatch, 4)
     np.testing.assert_array_equal(expected, moved())
 
 

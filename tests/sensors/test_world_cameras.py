@@ -1,16 +1,14 @@
 """Pictures of all worlds of a batch: as a client's camera sees the same world, and independent of the other worlds."""
 
 import dataclasses
-from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
 
+from tests.support.layouts import order_bodies_as_a_gpu
 from tests.support.terrain_scenes import hills
 from vinesim.core import frames
-from vinesim.plants.articulation_solver import ArticulationSolver
-from vinesim.plants.device_buffers import DeviceBuffers
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import LABEL_STRIDE, Organ
 from vinesim.scene.model import Model
@@ -31,7 +29,7 @@ from vinesim.sensors.camera.world_cameras import WorldCamera, WorldCameras, bunc
 from vinesim.worlds.plants import gathered, plants_of_worlds
 from vinesim.worlds.worlds import Worlds
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("layout")]
 
 SIZE = (97, 90)
 FIXED = WorldCamera(pose=look_at(np.array([-0.5, -0.8, 1.1]), np.array([0.9, 0.0, 0.7])), field_of_view=0.9)
@@ -197,10 +195,7 @@ def test_pictures_are_the_same_in_the_order_of_bodies_on_a_gpu(monkeypatch: pyte
 
     expected = drawn()
 
-    def interleaved(*given: Any, device: str) -> ArticulationSolver:
-        return ArticulationSolver(*given, buffers=DeviceBuffers(device, 4))
-
-    monkeypatch.setattr("vinesim.worlds.worlds.ArticulationSolver", interleaved)
+    order_bodies_as_a_gpu(monkeypatch, 4)
     np.testing.assert_array_equal(drawn(), expected)
 
 
@@ -279,15 +274,9 @@ def test_a_bunch_that_is_cut_off_looks_as_in_a_client() -> None:
     np.testing.assert_array_equal(cameras.labels.numpy(), first)
 
 
-@pytest.mark.parametrize("pitch", [1, 4], ids=["in order", "interleaved"])
-def test_canes_that_are_cut_look_as_in_a_client(pitch: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_canes_that_are_cut_look_as_in_a_client() -> None:
     """Nearly weightless, so that pieces come off slowly. The first cut parts the upper segment of a cane, the
     second one the piece, the third one the stump. The second world is not cut. After a reset the cane is whole."""
-
-    def solver(*given: Any, device: str) -> ArticulationSolver:
-        return ArticulationSolver(*given, buffers=DeviceBuffers(device, pitch))
-
-    monkeypatch.setattr("vinesim.worlds.worlds.ArticulationSolver", solver)
     parameters = msgspec.structs.replace(PARAMETERS, gravity=0.3)
     physics = client(hanging(1), SHEARS, parameters)
     cutter = physics.add_blade("shears", "head", BLADE.pose, BLADE.half)

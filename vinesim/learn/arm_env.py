@@ -58,6 +58,8 @@ class ArmEnv(TaskEnv):
         observation: ``"state"`` or ``"pictures"``: the numbers, or a dictionary of the numbers (``state``) and of
             pictures of :data:`CAMERAS`; see :class:`~vinesim.learn.task_env.TaskEnv`.
         picture_size: width and height of these pictures [px].
+        deterministic: whether equal seeds and actions give equal episodes to the bit on a GPU, too; see
+            :class:`~vinesim.worlds.worlds.Worlds`.
     """
 
     task_class: ClassVar[type[ArmTask]]
@@ -79,6 +81,7 @@ class ArmEnv(TaskEnv):
         render_mode: str | None = None,
         observation: str = "state",
         picture_size: int = PICTURE_SIZE,
+        deterministic: bool = False,
     ) -> None:
         task = self.task_class
         steps = task.max_steps if max_episode_steps is None else max_episode_steps
@@ -104,6 +107,7 @@ class ArmEnv(TaskEnv):
             parameters=task.parameters,
             device=device,
             blade=task.blade(),
+            deterministic=deterministic,
             **self.world_options,
         )
         super().__init__(

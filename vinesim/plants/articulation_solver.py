@@ -735,7 +735,9 @@ class ArticulationSolver:
         self.buffers.synchronize()
 
     def download(self) -> None:
-        """Copy the device's arrays of the awake trees to the host, as ``predict()`` and ``integrate()`` do."""
+        """Copy the device's arrays of the awake trees to the host, after calls of :meth:`advance` or after kernels have
+        changed the device's arrays. :meth:`upload` comes before the first such call."""
+        self.launches.download_trees()
         self.launches.download_prediction(len(self._runner.stepped))
         self.launches.download_joints(len(self._runner.stepped))
         self.buffers.synchronize()
@@ -1909,7 +1911,7 @@ class KernelLaunches:
         device = self.buffers.device
         shared = self.buffers.arrays
         names = dict.fromkeys(TREE_INPUTS + TREE_RESULTS)
-        copies = {name: wp.empty_like(shared[name], device=device) for name in names}
+        copies = {name: wp.zeros_like(shared[name], device=device) for name in names}  # until the first upload
         self.resident_arrays = self._arrays = shared | copies
         self.resident = self._record_step_kernels(parameters)
         self._arrays = shared

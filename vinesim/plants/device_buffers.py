@@ -11,7 +11,7 @@ up to the last body of the largest tree. The 32 threads of a warp then read one 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -180,6 +180,16 @@ class DeviceBuffers:
             there = np.zeros((self.slot_count, *data.shape[1:]), data.dtype)
             there[self.slots] = np.where(data >= 0, self.slots[data], data) if name in self._points else data
             self.arrays[name].assign(there)
+
+    def download(self, names: Iterable[str]) -> None:
+        """Copy all rows of some arrays with a row for each body to the host. This is too slow for every tick."""
+        if not self.has_copies:
+            return
+        body = np.zeros(self.slot_count, np.int32)
+        body[self.slots] = np.arange(len(self.slots))
+        for name in names:
+            here = self.arrays[name].numpy()[self.slots]
+            self.host[name][...] = np.where(here >= 0, body[here], here) if name in self._points else here
 
     def row_copier(
         self, names: tuple[str, ...], trees: str, count: wp.array, *, to_host: bool = False

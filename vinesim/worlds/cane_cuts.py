@@ -2,7 +2,8 @@
 
 What is beyond a cut falls as a floating component of its tree, and the stump stays, as in a client. A cut takes one of
 the tree's spare bodies (:mod:`vinesim.scene.spare_bodies`), so a tree can be cut as often as it has such bodies.
-Everything happens on the device; the state on the host does not learn of the cuts.
+Everything happens on the device. The state on the host does not learn of the cuts, but ``Worlds.download`` copies the
+changed rows of the trees (:data:`CHANGED_ROWS`) to the host.
 
 What this leaves out: canes with leaves, and canes of trees that are tied, stop a blade. Of each tree a closing cuts one
 cane. A short stump takes whole steps, however fast its first mode is.
@@ -31,6 +32,8 @@ from vinesim.scene.model import Model
 from vinesim.scene.spare_bodies import PLACE_STEP
 from vinesim.worlds.batch_contacts import BatchContacts
 
+CHANGED_ROWS = ("body_parent", "body_root", "body_offset", "body_rest", "joint_stiffness", "joint_damping")
+"""Arrays with a row for each body of the trees that cuts of canes change, beside masses."""
 BREAKS = 2
 """Number of times that each tree can break under its load, at least. GUESSED"""
 
@@ -121,8 +124,9 @@ class CaneCuts:
             return []
         arrays = self._plants.launches.resident_arrays
         trees = np.arange(len(self._plants.model.tree_first))
-        names = ("body_parent", "body_root", "body_offset", "body_rest", "joint_stiffness", "joint_damping")
-        rows = [arrays[name] for name in names] + [getattr(self._canes, name) for name in ("segment", "start", "end")]
+        rows = [arrays[name] for name in CHANGED_ROWS] + [
+            getattr(self._canes, name) for name in ("segment", "start", "end")
+        ]
         rows += [self.topology.grown, self.topology.kept]
         of_root = self._array(np.repeat(trees, self.cuts), wp.int32)
         return [

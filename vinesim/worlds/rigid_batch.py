@@ -57,6 +57,7 @@ class RigidBatch:
         device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
         contacts: number of contacts between rigid bodies of a world for which there is room, on average.
         own: names of arrays of mujoco_warp's model of which each world has rows of its own.
+        deterministic: whether a GPU sums in the same order each time. A CPU always does.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class RigidBatch:
         *,
         contacts: int = DEFAULT_CONTACTS,
         own: Collection[str] = (),
+        deterministic: bool = False,
     ) -> None:
         self.rigid = rigid
         self.count = count
@@ -85,6 +87,7 @@ class RigidBatch:
             self.model = self._mjw.put_model(m, dict.fromkeys(own, count))
             # Newton's method finds the acceleration without constraints, too; its own solver takes longer than a step
             self.model.opt.run_qacc_smooth = False
+            self.model.opt.deterministic = deterministic and self.device.is_cuda
             self.data = self._mjw.put_data(
                 m, rigid.mj_data, nworld=count, nconmax=contacts, njmax=limits + ROWS_PER_CONTACT * contacts
             )

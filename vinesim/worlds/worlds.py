@@ -15,8 +15,10 @@ import msgspec
 import numpy as np
 import warp as wp
 
+from vinesim.core.warp_arrays import struct_fields
 from vinesim.interaction.blades import Blade
 from vinesim.kernels.graph import KernelGraph, KernelLaunch
+from vinesim.kernels.worlds.free_bunches import PlantMasses
 from vinesim.kernels.worlds.reset import find_faults, forget_faults, restore_rows, restore_worlds
 from vinesim.plants.articulation_solver import TREE_RESULTS, ArticulationSolver, Beside
 from vinesim.rigid.rigid_world import MAX_RATE, RigidWorld
@@ -26,6 +28,7 @@ from vinesim.scene.state import State
 from vinesim.scene.values import RobotSpec
 from vinesim.worlds.batch_contacts import FULL_BLOCK, BatchContacts
 from vinesim.worlds.bunch_pool import OWN, BunchPool, add_pool
+from vinesim.worlds.cane_cuts import CHANGED_ROWS
 from vinesim.worlds.rigid_batch import RigidBatch
 
 DEFAULT_SLOTS = 16
@@ -79,6 +82,8 @@ class Worlds:
             (:func:`vinesim.scene.spare_bodies.with_spares`), see :mod:`vinesim.worlds.cane_cuts`. None: nothing is cut.
         bunches: number of bunches that can come off in each world.
         breaks: whether peduncles and canes break under their load, and canes keep a set, as in a client.
+        deterministic: whether equal worlds stay equal to the bit on a GPU, at the cost of speed (docs/worlds.md). On a
+            CPU they always do.
 
     Raises :class:`ValueError` if the number of trees does not fit or a tree needs substeps, or for a blade that a batch
     cannot have (see :class:`~vinesim.worlds.bunch_pool.BunchPool`),
@@ -97,6 +102,7 @@ class Worlds:
         blade: Blade | None = None,
         bunches: int = 1,
         breaks: bool = False,
+        deterministic: bool = False,
     ) -> None:
         parameters = msgspec.structs.replace(parameters, sleep=False, bunch_pool_size=0)
         self.model = model
@@ -108,7 +114,7 @@ class Worlds:
         has_pool = blade is not None or breaks
         if has_pool:
             add_pool(rigid, bunches)
-        self.bodies = RigidBatch(rigid, count, device, own=OWN if has_pool else ())
+        self.bodies = RigidBatch(rigid, count, device, own=OWN if has_pool else (), deterministic=deterministic)
         """Robots and boxes."""
         self.plants = ArticulationSolver(model, State.at_rest(model), parameters, device=device)
         """Trees."""
@@ -132,6 +138,7 @@ class Worlds:
         if has_pool:
             state = (self.faults, self.fault_count)
             self.pool = BunchPool(self.plants, self.bodies, self.contacts, blade, *state, breaks=breaks)
+        self.plants.launches.upload_trees()  # a reset returns to what the device has now
         self._check = self._check_graph(device)
         self._reset = self._reset_graph(device)
 
@@ -219,6 +226,9 @@ class Worlds:
         self.bodies.predict()
 
     def download(self) -> None:
-        """Copy the states of all plants to the host: afterwards ``plants.state`` holds their poses."""
+        """Copy the states of all plants to the host: afterwards ``plants.state`` holds their poses, and ``plants`` what
+        cuts and breaks have changed."""
         self.plants.download()
+        if self.pool is not None:
+            self.plants.buffers.download([*struct_fields(PlantMasses), *CHANGED_ROWS])
         self.plants.forward_kinematics()

@@ -392,9 +392,10 @@ def number_contacts(
                 count = count + 1
         world_contacts_out.first[tree] = first
         world_contacts_out.of_tree[tree] = wp.min(count, slots) - first
-    world_contacts_out.count[world] = wp.min(count, slots)
+    listed = wp.min(count, slots)
+    world_contacts_out.count[world] = listed
     world_contacts_out.sweeps[world] = 0
-    if count > few:
+    if listed > few:
         world_contacts_out.busy[wp.atomic_add(world_contacts_out.busy_count, 0, 1)] = world
     if count > slots:
         wp.atomic_add(world_contacts_out.dropped, world, count - slots)

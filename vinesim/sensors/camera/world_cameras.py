@@ -30,7 +30,7 @@ from vinesim.scene.values import RigidVisual
 from vinesim.sensors.camera.exposure import usual_exposure
 from vinesim.sensors.camera.sunlight import DEFAULT_SUN, OutdoorLight, set_daylight, set_samples
 from vinesim.sensors.primitives import textures
-from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
+from vinesim.sensors.primitives.scene_primitives import Primitives, ground_struct, rest_snapshot
 from vinesim.sensors.raster.camera_rasterizer import MAX_DEPTH
 from vinesim.sensors.raster.primitive_arrays import CONE
 from vinesim.worlds.bunch_pool import shapes_of_bunches
@@ -39,7 +39,7 @@ from vinesim.worlds.worlds import Worlds, write_mask
 
 LARGEST = 1024
 """[px] Largest width and height of a picture."""
-_COPIED = ("leaf_texture", "noise_texture", "soil_texture", "rows", "colours", "ground")
+_COPIED = ("leaf_texture", "noise_texture", "soil_texture", "rows", "colours")
 """Fields of ``Materials`` that all worlds share."""
 _LOOKS = {"material": wp.int32, "label": wp.int32, "tint": wp.vec3, "sky": float}
 """Fields of :class:`~vinesim.kernels.worlds.pictures.Looks`, with their types."""
@@ -111,6 +111,7 @@ class WorldCameras:
         Trees and bunches are numbered within their world, in the order of its trees."""
         self.rgb: wp.array | None = self._zeros(wp.vec3ub, *shape) if colours else None
         """[world, camera, row, column] Three numbers of eight bits, sRGB; None without ``colours``."""
+        self._ground = ground_struct(worlds.model.terrain, str(self._device))
         self._due = wp.full(worlds.count, True, dtype=wp.bool, device=self._device)
         self.launches = self._all_launches(variants[0], np.asarray(sun, float))
         """The launches that draw all pictures, by name, in their order."""
@@ -230,9 +231,7 @@ class WorldCameras:
         run = 1 if self._device.is_cuda else pixels  # on a CPU a thread takes a tile, to pass the structs less often
         # at least two: a launch with a width of 1 has one dimension
         shape = {"threads": worlds.count * cameras, "width": max(tiles * pixels // run, 2), "block": _BLOCKS[1]}
-        ground = first.primitives.ground
-        ground.residual = ground.residual.to(self._device)
-        given = [tables.shapes, tables.clusters, tables.variants, views, ground, tables.looks.label]
+        given = [tables.shapes, tables.clusters, tables.variants, views, self._ground, tables.looks.label]
         given += [label(Organ.GROUND, 0), motion, self._due, worlds.faults, bounds, cluster_bounds, float("inf"), run]
         draw = KernelLaunch(kernels.draw_pictures, given, [self._primitive, self.depth, self.labels], **shape)
         launches = {"kinematics": move, "pose": pose, "draw": draw}
@@ -261,6 +260,7 @@ class WorldCameras:
             setattr(made, name, value.to(self._device) if isinstance(value, wp.array) else value)
         for name in ("material", "tint", "sky"):
             setattr(made, name, getattr(self._tables.looks, name))
+        made.ground = self._ground
         made.ground_sky = self._array(np.ones((2, 2), np.float32), float)
         made.ground_x = made.ground_y = -0.5 * _OPEN
         made.ground_cell = _OPEN
