@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import pathlib
+import re
 import sys
 from collections.abc import Callable
 
@@ -185,3 +186,6 @@ def test_a_client_takes_a_policy_and_stops(tmp_path: pathlib.Path) -> None:
     assert report["time"] == pytest.approx(4.0, abs=0.1)
     assert report["job"]["reason"] == "reach: not done after 4 s"
     assert report["faults"] == {}
+    done = programs.run([*command[:-2], "reach", "--no-ros", "--seed", "3"], timeout=TIMEOUT)
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"robot: reach done after [0-3]\.\d s$", done.stderr, re.MULTILINE), "the policy that ships"

@@ -80,8 +80,8 @@ def test_a_file_that_is_no_policy_is_refused_in_one_line(tmp_path: pathlib.Path)
     by_hand().save(cut)
     cut.write_bytes(cut.read_bytes()[:-100])
     for path, message in (
-        (tmp_path / "none.npz", "none.npz cannot be read: No such file"),
-        (tmp_path, "cannot be read"),
+        (tmp_path / "none.npz", "no file .*none.npz.*give a path or one of: pick, prune, reach"),
+        (tmp_path, "is a folder; give the policy.npz"),
         (text, "a.npz is no policy"),
         (other, "b.npz is no policy of this version"),
         (single, "c.npz is no policy"),
@@ -123,3 +123,18 @@ def test_a_damaged_file_is_refused_with_what_is_wrong(
     np.savez(path, **{name: value for name, value in fields.items() if value is not None})
     with pytest.raises(PolicyError, match=message):
         load_policy(path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["reach", "pick", "prune"])
+def test_the_policies_that_ship_do_their_tasks_on_vines_never_seen(task: str) -> None:
+    """docs/worlds.md has the shares of 500."""
+    pytest.importorskip("mujoco_warp")
+    from vinesim.learn.evaluate import evaluate, evaluate_with_full_physics
+
+    policy = load_policy(task)
+    assert policy.task == task
+    in_batch = evaluate(policy, 40, seed=7)
+    assert in_batch.successes >= 36
+    assert in_batch.faults == 0
+    assert evaluate_with_full_physics(policy, 5, seed=7).successes >= 4

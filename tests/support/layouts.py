@@ -1,8 +1,8 @@
 """Where batches of worlds run in tests: the fixture ``layout`` of the files that test batches.
 
 ``cpu`` is what a user without a GPU has. ``order of a GPU`` is a CPU whose kernels work on copies of the host's arrays,
-with the bodies in the order of a GPU, so that most faults that a GPU would show are found without one. ``cuda`` needs an
-NVIDIA GPU; ``pytest -m gpu`` runs these tests alone.
+with the bodies in the order of a GPU, so that most faults that a GPU would show are found without one. ``cuda`` needs
+an NVIDIA GPU; ``pytest -m gpu`` runs these tests alone.
 """
 
 import inspect

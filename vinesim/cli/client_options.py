@@ -131,8 +131,8 @@ class ClientOptions:
         pathlib.Path | None,
         OF_ROBOT,
         typer.Option(
-            help="Robots: a policy.npz of vinesim train. It does its task with the task's arm and shoots, drawn by "
-            "--seed, and stops."
+            help="Robots: a policy.npz of vinesim train, or reach, pick or prune, which ship with vinesim. It does its "
+            "task with the task's arm and shoots, drawn by --seed, and stops."
         ),
     ] = None
     bunches: Annotated[

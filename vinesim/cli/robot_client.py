@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -92,6 +93,9 @@ def run(options: ClientOptions) -> int:
             sensors=lambda: _sensor_status(sensors),
             publish=lambda values: [one.publish_diagnostics(values) for one in sensors],
         )
+        if task is not None and task.succeeded:  # a failure has been logged
+            seconds = sum(task.durations.values())
+            print(f"{session.name}: {options.job or options.policy} done after {seconds:.1f} s", file=sys.stderr)
         if options.out is not None:
             for process in sensors:
                 process.sensors.complete_counts()

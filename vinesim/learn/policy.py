@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from vinesim.core.data_files import DataFileNotFound, find_data_file
 from vinesim.core.errors import writing
 from vinesim.core.toml_loader import DataError
 from vinesim.sensors.export.files import write_files
@@ -109,8 +110,15 @@ class Policy:
             write_files({pathlib.Path(path): [data.getvalue()]})
 
 
-def load_policy(path: str | pathlib.Path) -> Policy:
-    """Returns the policy in the file ``path``. Raises :class:`PolicyError`."""
+def load_policy(name: str | pathlib.Path) -> Policy:
+    """Returns the policy in the file ``name``, or the one that ships with vinesim under that name (``data/policies``).
+    Raises :class:`PolicyError`."""
+    if pathlib.Path(name).is_dir():
+        raise PolicyError(f"{name} is a folder; give the policy.npz of a training")
+    try:
+        path = find_data_file("policies", str(name), ".npz")
+    except DataFileNotFound as error:
+        raise PolicyError(str(error)) from None
     try:
         with zipfile.ZipFile(path):  # NumPy would also take a single array
             pass

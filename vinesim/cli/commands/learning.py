@@ -16,7 +16,11 @@ def train(
         pathlib.Path | None, typer.Option(help="Folder for policy.npz, curve.csv and summary.json of a training.")
     ] = None,
     evaluate: Annotated[
-        pathlib.Path | None, typer.Option(help="Do not train: evaluate this policy.npz on vines never seen.")
+        pathlib.Path | None,
+        typer.Option(
+            help="Do not train: evaluate this policy.npz on vines never seen; or reach, pick or prune, which ship "
+            "with vinesim."
+        ),
     ] = None,
     worlds: Annotated[
         int | None,
@@ -56,6 +60,7 @@ def train(
       vinesim train reach --out run --device cuda --worlds 8192 --minutes 5 --variation ranges.toml
       vinesim train reach --evaluate run/policy.npz --worlds 500
       vinesim train reach --evaluate run/policy.npz --full-physics
+      vinesim train pick --evaluate pick
     """
     from vinesim.cli.train import run_evaluation, run_training
 
