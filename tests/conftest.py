@@ -10,6 +10,7 @@ from collections.abc import Generator, Iterator
 
 import hypothesis
 import pytest
+import warp as wp
 
 from tests.support import layouts, orphans
 
@@ -27,6 +28,17 @@ hypothesis.settings.load_profile("test")
 SKIPS_FAIL = bool(os.environ.get("CI"))
 """In CI everything that tests need is installed, so a skip hides a missing part. Tests marked ``gpu`` may be
 skipped."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--check-bounds", action="store_true", help="compile kernels with checks of array bounds; a wrong index aborts"
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("--check-bounds"):
+        wp.config.mode = "debug"
 
 
 @pytest.hookimpl(wrapper=True)  # else xdist reads the groups before they are there
