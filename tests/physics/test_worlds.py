@@ -13,6 +13,7 @@ from vinesim.world import Physics
 
 pytest.importorskip("mujoco_warp")
 from vinesim.worlds.plants import plants_of_worlds
+from vinesim.worlds.rigid_batch import RigidBatch
 from vinesim.worlds.worlds import Worlds
 
 pytestmark = pytest.mark.usefixtures("layout")
@@ -195,6 +196,22 @@ def test_no_world_is_listed_twice_for_a_longer_search_if_all_lack_room_for_conta
     assert longest <= 4
 
 
+@pytest.mark.slow
+def test_contacts_of_robots_beyond_their_room_are_a_fault_and_print_nothing(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The fingers of a hand press on each other; there is room for one contact of each world."""
+    monkeypatch.setitem(RigidBatch.__init__.__kwdefaults__, "contacts", 1)
+    hand = scenes.gripper("hand", np.array([5.0, 5.0, 1.0]))
+    worlds = Worlds(bunches(2), 2, robots=[hand], parameters=PARAMETERS)
+    worlds.bodies.targets.assign(np.array([[0.0, 0.12, 0.12]] * 2, np.float32))
+    worlds.step(60)
+    assert worlds.faults.numpy().tolist() == [ROOM, ROOM]
+    assert worlds.fault_count.numpy().tolist() == [1, 1]
+    assert "overflow" not in "".join(capfd.readouterr())
+
+
+@pytest.mark.slow
 def test_plants_of_worlds_are_those_of_their_models():
     """Two worlds of one scene, and one of another, whose canes are longer."""
     one, other = scenes.cane_row(2), scenes.cane_row(2)

@@ -88,6 +88,7 @@ class RigidBatch:
             # Newton's method finds the acceleration without constraints, too; its own solver takes longer than a step
             self.model.opt.run_qacc_smooth = False
             self.model.opt.deterministic = deterministic and self.device.is_cuda
+            self.model.opt.warn_overflow = 0  # it would print to raise what users cannot; a world's fault tells it
             self.data = self._mjw.put_data(
                 m, rigid.mj_data, nworld=count, nconmax=contacts, njmax=limits + ROWS_PER_CONTACT * contacts
             )
