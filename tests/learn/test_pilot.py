@@ -1,12 +1,15 @@
 """A policy in the physics of a client, compared with the same policy in a batch."""
 
+import asyncio
 import dataclasses
 import json
 import pathlib
 import re
 import sys
 from collections.abc import Callable
+from typing import Any
 
+import aiohttp
 import msgspec
 import numpy as np
 import pytest
@@ -181,7 +184,7 @@ def test_a_client_takes_a_policy_and_stops(tmp_path: pathlib.Path) -> None:
     assert done.returncode == 2
     assert "--robot with --policy" in done.stderr
     done = programs.run([*command, "--out", str(tmp_path / "run")], timeout=TIMEOUT)
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 1, done.stderr
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert report["time"] == pytest.approx(4.0, abs=0.1)
     assert report["job"]["reason"] == "reach: not done after 4 s"
@@ -189,3 +192,29 @@ def test_a_client_takes_a_policy_and_stops(tmp_path: pathlib.Path) -> None:
     done = programs.run([*command[:-2], "reach", "--no-ros", "--seed", "3"], timeout=TIMEOUT)
     assert done.returncode == 0, done.stderr
     assert re.search(r"robot: reach done after [0-3]\.\d s$", done.stderr, re.MULTILINE), "the policy that ships"
+
+
+@pytest.mark.slow
+def test_with_a_page_the_task_begins_when_it_is_opened_and_the_client_ends_when_it_is_closed() -> None:
+    command = [sys.executable, "-m", "vinesim", "client", "--role", "robot", "--policy", "reach", "--no-ros"]
+    with programs.Popen([*command, "--page", "0", "--status", "json"], stdout=-1, stderr=-1) as client:
+        assert client.stderr is not None
+        assert client.stdout is not None
+        (address,) = re.findall(r"in a browser: (\S+)", next(line for line in client.stderr if "browser: " in line))
+        assert "begins when a browser has opened the page" in client.stderr.readline()
+
+        async def page() -> float:
+            """Stays open until the world is a second older than an episode of Reach can be."""
+            async with aiohttp.ClientSession() as session, session.ws_connect(address + "state"):
+                while (time := await asyncio.to_thread(_next_time, client.stdout)) < Reach.max_steps * 0.04 + 1.0:
+                    assert client.poll() is None
+                return time
+
+        asyncio.run(asyncio.wait_for(page(), TIMEOUT))
+        assert client.wait(TIMEOUT) == 0
+        assert "reach done after" in client.stderr.read()
+
+
+def _next_time(lines: Any) -> float:
+    """Returns the simulated time [s] of the next status of a client."""
+    return float(json.loads(lines.readline())["time"])

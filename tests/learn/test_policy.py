@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("gymnasium")
+from vinesim.learn import TASKS
 from vinesim.learn.policy import ACTIVATIONS, Policy, PolicyError, load_policy
 
 
@@ -80,7 +81,7 @@ def test_a_file_that_is_no_policy_is_refused_in_one_line(tmp_path: pathlib.Path)
     by_hand().save(cut)
     cut.write_bytes(cut.read_bytes()[:-100])
     for path, message in (
-        (tmp_path / "none.npz", "no file .*none.npz.*give a path or one of: pick, prune, reach"),
+        (tmp_path / "none.npz", "no file .*none.npz.*give a path or one of: expose, pick, prune, reach"),
         (tmp_path, "is a folder; give the policy.npz"),
         (text, "a.npz is no policy"),
         (other, "b.npz is no policy of this version"),
@@ -90,6 +91,15 @@ def test_a_file_that_is_no_policy_is_refused_in_one_line(tmp_path: pathlib.Path)
         with pytest.raises(PolicyError, match=message) as refused:
             load_policy(path)
         assert "\n" not in str(refused.value)
+
+
+def test_observations_of_another_task_or_with_pictures_are_refused() -> None:
+    policy = load_policy("reach")
+    with pytest.raises(ValueError, match=r"\(1, 34\): the policy for reach takes \[\.\.\., 31\]"):
+        policy(np.zeros((1, 34)))
+    with pytest.raises(ValueError, match=r"observation\['state'\]"):
+        policy({"state": np.zeros(31)})  # pyright: ignore[reportArgumentType]
+    assert repr(policy) == "Policy('reach', 31 -> 256 -> 128 -> 64 -> 7, 'elu')"
 
 
 def test_code_in_a_file_does_not_run(tmp_path: pathlib.Path) -> None:
@@ -126,7 +136,7 @@ def test_a_damaged_file_is_refused_with_what_is_wrong(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", ["reach", "pick", "prune"])
+@pytest.mark.parametrize("task", TASKS)
 def test_the_policies_that_ship_do_their_tasks_on_vines_never_seen(task: str) -> None:
     """docs/worlds.md has the shares of 500."""
     pytest.importorskip("mujoco_warp")

@@ -104,6 +104,12 @@ def test_a_world_that_explodes_ends_with_its_fault_and_the_others_do_not_notice(
     assert not broken[3][4].any(), "the world has begun again"
 
 
+def test_an_action_before_the_first_reset_is_refused():
+    env = gymnasium.make_vec("vinesim/Reach-v0", num_envs=1)
+    with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
+        env.step(np.zeros((1, 7), np.float32))
+
+
 def test_arrays_on_the_device_have_the_numbers_of_those_of_numpy_and_are_no_copies():
     """By DLPack, as PyTorch would take them; NumPy takes those of a CPU. The results of an action stay until the action
     after the next one."""

@@ -77,6 +77,17 @@ def test_an_evaluation_prints_one_line(tmp_path: pathlib.Path, more: tuple[str, 
 
 
 @pytest.mark.slow
+def test_ctrl_c_ends_an_evaluation_and_says_how_far_it_was() -> None:
+    arguments = command("pick", "--evaluate", "pick", "--full-physics", "--worlds", 5000)
+    with programs.Popen(arguments, stderr=subprocess.PIPE, stdout=subprocess.PIPE) as evaluation:
+        assert evaluation.stderr is not None
+        next(line for line in evaluation.stderr if "of 5000" in line)
+        evaluation.send_signal(signal.SIGINT)
+        assert evaluation.wait(TIMEOUT) == 130
+        assert re.search(r"^interrupted  world \d+ of 5000, \d+ picked$", evaluation.stderr.read(), re.MULTILINE)
+
+
+@pytest.mark.slow
 def test_the_example_of_the_page_runs_with_a_policy(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The block of docs/worlds.md. The commands of the page are those of the tests here, with fewer worlds."""
     page = (pathlib.Path(__file__).parents[2] / "docs" / "worlds.md").read_text()

@@ -131,8 +131,9 @@ class ClientOptions:
         pathlib.Path | None,
         OF_ROBOT,
         typer.Option(
-            help="Robots: a policy.npz of vinesim train, or reach, pick or prune, which ship with vinesim. It does its "
-            "task with the task's arm and shoots, drawn by --seed, and stops."
+            help="Robots: a policy.npz of vinesim train, or reach, expose, pick or prune, which ship with vinesim. It "
+            "does its task with the task's arm and shoots, drawn by --seed (1), and stops; exit code 1 if it fails. "
+            "With --page it begins when a browser has opened the page, and stops when that is closed."
         ),
     ] = None
     bunches: Annotated[

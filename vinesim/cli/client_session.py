@@ -9,9 +9,10 @@ import os
 import pathlib
 import sys
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import msgspec
 
@@ -38,6 +39,9 @@ from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene, with_seed
 from vinesim.web import page_files
 
+if TYPE_CHECKING:
+    from vinesim.web.page_server import PageServer
+
 SWITCH_INTERVAL = 2e-4
 """Longest time for which another thread may hold the interpreter lock when the loop needs it [s]. Python's default is 5
 ms."""
@@ -49,6 +53,8 @@ ENOUGH = 0.95
 """Share of the requested rate of pictures and scans below which the status line shows both rates [1]."""
 CLOCK_TIMEOUT = 2.0
 """Longest time for which the first step waits for the server's clock [s]."""
+VIEWER_PERIOD = 0.05
+"""Time between two looks whether a browser has opened the page [s]."""
 TRACE_CAPACITY = 1 << 17
 """Number of steps that a trace of one bunch can hold: 22 minutes."""
 
@@ -80,6 +86,7 @@ class ClientSession:
         self._hub = MemoryHub()
         self._stack = contextlib.ExitStack()
         self._stop = threading.Event()
+        self._page: PageServer | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -156,8 +163,16 @@ class ClientSession:
         else:
             server = self.enter(PageServer(world, port, sound=sound))
         print(f"the vineyard in a browser: {server.address}", file=sys.stderr, flush=True)
+        self._page = server
         client.post_step.append(lambda _: world.collect(server))
         client.other_faults.append(lambda: {"page_messages_refused": server.refused_messages})
+
+    def wait_for_viewer(self) -> None:
+        """Wait until a browser has opened the page. Returns at once if there is no page."""
+        if self._page is not None:
+            print("the task begins when a browser has opened the page", file=sys.stderr, flush=True)
+            while not self._page.has_viewers:
+                time.sleep(VIEWER_PERIOD)
 
     def run(
         self,
@@ -168,7 +183,8 @@ class ClientSession:
         sensors: Callable[[], dict[str, Any]] = dict,
         publish: Callable[[dict[str, Any]], Any] = lambda _: None,
     ) -> Status:
-        """Step by the world's clock until a signal, the time limit or the end of the ``task``; return the final status.
+        """Step by the world's clock until a signal, the time limit, or until the ``task`` is done and no browser shows
+        the page any more; return the final status.
 
         ``sent``: returns the numbers of ROS messages by topic. ``sensors``: returns the status of sensors. ``publish``:
         is called with every status, for /diagnostics.
@@ -187,7 +203,8 @@ class ClientSession:
         reporter.start()
         self._stack.callback(reporter.join)
         self._stack.callback(self._stop.set)
-        is_done = (lambda: False) if task is None else (lambda: task.is_done)
+        page = self._page
+        is_done = (lambda: False) if task is None else (lambda: task.is_done and not (page and page.has_viewers))
         try:
             run_loop(self._stop, client.tick, loop, self.options.seconds, client.physics.dt, is_done)
         except RuntimeError as failure:

@@ -36,7 +36,8 @@ from vinesim.world import Physics
 
 
 def run(options: ClientOptions) -> int:
-    """Build the client from its options, step until the end, then write the requested files. Returns the exit code."""
+    """Build the client from its options, step until the end, then write the requested files. Returns the exit code: 1
+    if the task of ``--policy`` has failed."""
     validate_task_name(options.job)
     validate_sight(options.job, options.see)
     harvest = HarvestOptions.named(options.bunches, options.order)
@@ -86,6 +87,8 @@ def run(options: ClientOptions) -> int:
         if digest is not None:
             client.post_step.append(digest)
         session.show_page(client)
+        if learned is not None:
+            session.wait_for_viewer()
         status = session.run(
             client,
             task=task,
@@ -110,7 +113,7 @@ def run(options: ClientOptions) -> int:
             if client.trace is not None:
                 with writing(options.out / "trace.npz"):
                     client.trace.rows().save(options.out / "trace.npz")
-    return 0
+    return int(learned is not None and task is not None and bool(task.reason))
 
 
 class _LearnedTask(NamedTuple):
@@ -138,13 +141,15 @@ def _learned_task(options: ClientOptions) -> _LearnedTask:
     if given is not None:
         raise UsageError(f"{given} with --policy {options.policy}: the task has its own robot and plants; leave it out")
     from vinesim.learn.arm_task import BASE
-    from vinesim.learn.evaluate import task_of, unseen_plants, wanted_bunches
+    from vinesim.learn.evaluate import DEFAULT_SEED, task_of, unseen_plants, wanted_bunches
     from vinesim.learn.pilot import PolicyTask, task_description
     from vinesim.learn.policy import load_policy
 
     policy = load_policy(str(options.policy))
     task = task_of(policy)
-    seed = options.seed or 0
+    seed = DEFAULT_SEED if options.seed is None else options.seed
+    if seed < 0:
+        raise UsageError(f"--seed {seed} with --policy {options.policy}: give 0 or more")
     (wanted,) = wanted_bunches(task, 1, seed)
     return _LearnedTask(
         unseen_plants(task, 0, seed),

@@ -109,7 +109,7 @@ def run_evaluation(
 ) -> int:
     """Evaluate the policy in ``file`` and print the result. Returns the exit code."""
     if out is not None:
-        raise UsageError(f"--out {out} with --evaluate {file}: an evaluation writes no files; leave --out out")
+        raise UsageError(f"--out {out} with --evaluate {file}: an evaluation writes no files; omit --out")
     _check(task, device)
     from vinesim.learn.evaluate import evaluate, evaluate_with_full_physics
     from vinesim.learn.policy import load_policy
@@ -120,7 +120,7 @@ def run_evaluation(
         raise UsageError(f"{file} is a policy for {policy.task}; run: vinesim train {policy.task} --evaluate {file}")
     ranges = variation or Variation()
     if full and device != "cpu":
-        raise UsageError(f"--full-physics with --device {device}: it runs on the cpu; leave --device out")
+        raise UsageError(f"--full-physics with --device {device}: it runs on the cpu; omit --device")
     with _reporting() as report:
         if full:
             count = worlds or FULL_PHYSICS_WORLDS
@@ -134,14 +134,23 @@ def run_evaluation(
 
 @contextlib.contextmanager
 def _reporting() -> Iterator[Callable[[str], None]]:
-    """Context of an evaluation, whose value shows its progress. Ctrl-C ends the evaluation."""
-    with Interrupts() as interrupts, ProgressLine() as line:
+    """Context of an evaluation, whose value shows its progress. Ctrl-C ends the evaluation, and prints how far it
+    was."""
+    last = ""
 
-        def report(text: str) -> None:
-            interrupts.check()
-            line.show(text)
+    def report(text: str) -> None:
+        nonlocal last
+        interrupts.check()
+        last = text
+        line.show(text)
 
-        yield report
+    try:
+        with Interrupts() as interrupts, ProgressLine() as line:
+            yield report
+    except KeyboardInterrupt:
+        if last:
+            print(f"interrupted  {last}", file=sys.stderr, flush=True)
+        raise
 
 
 def _check(task: str, device: str) -> None:

@@ -23,6 +23,8 @@ from vinesim.learn.variation import Variation, as_variation
 from vinesim.scene.model import Model
 from vinesim.world import Physics
 
+DEFAULT_SEED = 1
+"""Seed of an evaluation unless another one is given."""
 UNSEEN = 2**31
 """Smallest seed of vines for evaluations. Trainings use smaller seeds."""
 
@@ -68,7 +70,7 @@ def evaluate(
     policy: Policy,
     worlds: int = 500,
     *,
-    seed: int = 1,
+    seed: int = DEFAULT_SEED,
     device: str = "cpu",
     variation: Variation | str | pathlib.Path = Variation(),
     report: Report = _no_report,
@@ -106,7 +108,7 @@ def evaluate_with_full_physics(
     policy: Policy,
     worlds: int = 100,
     *,
-    seed: int = 1,
+    seed: int = DEFAULT_SEED,
     variation: Variation | str | pathlib.Path = Variation(),
     report: Report = _no_report,
 ) -> Evaluation:

@@ -35,12 +35,12 @@ class PolicyError(DataError):
     """Raised for a file that is no policy of vinesim. The message is one line."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Policy:
-    """A network of fully connected layers. ``policy(observation)`` returns the action.
+    """A network of fully connected layers. ``policy(observation)`` returns the action, in an array of NumPy.
 
-    Raises :class:`ValueError` for arrays whose shapes do not fit, numbers that are not finite, deviations that are not
-    above 0, and an unknown activation.
+    Raises :class:`ValueError` for observations of another shape. When it is made, raises the same for arrays whose
+    shapes do not fit, numbers that are not finite, deviations that are not above 0, and an unknown activation.
     """
 
     task: str
@@ -84,9 +84,18 @@ class Policy:
         """Number of an action's components."""
         return len(self.biases[-1])
 
+    def __repr__(self) -> str:
+        widths = " -> ".join(map(str, (self.inputs, *map(len, self.biases))))
+        return f"Policy({self.task!r}, {widths}, {self.activation!r})"
+
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Returns the actions [..., outputs], from -1 to 1, for observations [..., inputs]."""
-        x = (np.asarray(observation, np.float32) - self.mean) / self.deviation
+        if isinstance(observation, dict):
+            raise ValueError("an observation with pictures: give the policy its numbers, observation['state']")
+        given = np.asarray(observation, np.float32)
+        if given.shape[-1:] != self.mean.shape:
+            raise ValueError(f"observations {given.shape}: the policy for {self.task} takes [..., {self.inputs}]")
+        x = (given - self.mean) / self.deviation
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             x = ACTIVATIONS[self.activation](x @ weight.T + bias)
         return np.clip(x @ self.weights[-1].T + self.biases[-1], -1.0, 1.0).astype(np.float32)

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.core import frames
+from vinesim.core.errors import UsageError
 from vinesim.interaction.blades import Blade
 from vinesim.interaction.cutting_force import DORMANT_ENERGY_SHARE, DORMANT_STRENGTH
 from vinesim.kernels.graph import KernelLaunch
@@ -127,7 +128,8 @@ class PruneEnv(ArmEnv):
     with a reward lower by 2 if a cane is cut elsewhere. It is truncated after 100 actions (4 s).
 
     :class:`~vinesim.learn.arm_env.ArmEnv` describes arguments. Of the variation, the canes take ``cane`` (their
-    length), thickness, modulus and damping. Raises :class:`ValueError` for canes that swing too fast.
+    length), thickness, modulus and damping. Raises :class:`~vinesim.core.errors.UsageError` for canes that swing too
+    fast.
     """
 
     task_class = Prune
@@ -141,10 +143,10 @@ def least_length(thickness: float, modulus: float) -> float:
 
 def canes(rng: np.random.Generator, variation: Variation) -> Model:
     """Returns :data:`CANES` upright dormant canes in front of the arm. Places and directions are GUESSED. Raises
-    :class:`ValueError` if canes in these ranges may swing too fast for a step of 10 ms."""
+    :class:`~vinesim.core.errors.UsageError` if canes in these ranges may swing too fast for a step of 10 ms."""
     least = least_length(variation.thickness[1], variation.modulus[1])
     if variation.cane[0] < least:
-        raise ValueError(
+        raise UsageError(
             f"cane from {variation.cane[0]:g}: below {least:.3f} m, canes with a thickness of up to "
             f"{variation.thickness[1]:g} m and a modulus of up to {variation.modulus[1]:g} Pa swing too fast; "
             "give longer, thinner or softer ones"

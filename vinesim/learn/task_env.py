@@ -136,6 +136,7 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         self._history = self.empty(float, variation.delay[1] + 1, actions)
         self._delay = self.on_device(rng.integers(*variation.delay, self.num_envs, endpoint=True), wp.int32)
         worlds.contacts.friction_scale.assign(rng.uniform(*variation.friction, self.num_envs))
+        self._has_begun = False
         self._seed = wp.zeros(1, dtype=wp.int32, device=device)
         self.elapsed = self.empty(wp.int32)
         """[world] Number of actions of the episode so far, on the device."""
@@ -216,6 +217,7 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         if isinstance(seed, list):
             raise ValueError("seed: give one number for all worlds")
         super().reset(seed=seed)
+        self._has_begun = True
         self._seed.fill_(int(self.np_random.integers(2**31)))
         self._episode.zero_()
         self.elapsed.zero_()
@@ -229,7 +231,10 @@ class TaskEnv(VectorEnv[Any, Any, Any], abc.ABC):
         return self._observed(results.observation, results.pictures), {"success": self._given(results.success)}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Take one action in each world; see the class and :class:`gymnasium.vector.VectorEnv`."""
+        """Take one action in each world; see the class and :class:`gymnasium.vector.VectorEnv`. Raises
+        :class:`gymnasium.error.ResetNeeded` before the first :meth:`reset`."""
+        if not self._has_begun:
+            raise gymnasium.error.ResetNeeded("step() before reset(): call reset() first")
         self._take(actions)
         results = self._next_results()
         self._move()

@@ -100,7 +100,8 @@ def require_libraries() -> None:
         importlib.import_module("vinesim.learn.rsl")
         importlib.import_module("rsl_rl.runners")
     except ImportError as error:
-        raise MissingExtra(f"training needs PyTorch and rsl_rl: pip install 'vinesim[train]' ({error})") from error
+        missing = error.__cause__ or error
+        raise MissingExtra(f"training needs PyTorch and rsl_rl: pip install 'vinesim[train]' ({missing})") from error
 
 
 def _learning_rate(fixed: float | None) -> dict[str, Any]:

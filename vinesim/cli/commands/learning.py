@@ -18,8 +18,8 @@ def train(
     evaluate: Annotated[
         pathlib.Path | None,
         typer.Option(
-            help="Do not train: evaluate this policy.npz on vines never seen; or reach, pick or prune, which ship "
-            "with vinesim."
+            help="Do not train: evaluate this policy.npz on vines never seen; or reach, expose, pick or prune, which "
+            "ship with vinesim."
         ),
     ] = None,
     worlds: Annotated[
