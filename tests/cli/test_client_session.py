@@ -34,6 +34,7 @@ def session(monkeypatch: pytest.MonkeyPatch) -> ClientSession:
     )
     one._stop = threading.Event()
     one._stack = contextlib.ExitStack()
+    one._page = None
     return one
 
 

@@ -64,8 +64,6 @@ T = TypeVar("T")
 class ClientSession:
     """One client process: its scene, its buses and its loop. A context manager that closes all of them in order."""
 
-    _page: PageServer | None = None
-
     def __init__(self, options: ClientOptions, model: Model | None = None) -> None:
         """Check the options and generate the vineyard, unless a ``model`` replaces it. Raises errors of the scene and
         :class:`UsageError`."""
@@ -88,6 +86,7 @@ class ClientSession:
         self._hub = MemoryHub()
         self._stack = contextlib.ExitStack()
         self._stop = threading.Event()
+        self._page: PageServer | None = None
 
     def __enter__(self) -> Self:
         return self

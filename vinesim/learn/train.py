@@ -34,8 +34,8 @@ SEEDS_APART = 1_000_003
 MINI_BATCHES = 4
 """Least number of mini-batches of an update of the policy."""
 MINI_BATCH = 8192
-"""Largest number of actions in a mini-batch. TUNED on the task pick: with four mini-batches of 32,768 actions, 4,096
-worlds take far fewer steps of the optimizer than they could."""
+"""Largest number of actions in a mini-batch. GUESSED: with four mini-batches of 32,768 actions, 4,096 worlds would
+take few steps of the optimizer for the time that their actions take. Pick was only trained with these."""
 LEAST_NOISE = 0.15
 """Deviation of the explored actions above which it may be limited. GUESSED: it moves a hand by less than 0.1 m/s."""
 VINES = 256
@@ -187,7 +187,10 @@ class Training:
             "actor": network | {"distribution_cfg": actions},
             "critic": network,
             "algorithm": PPO
-            | {"gamma": env.task_class.discount, "num_mini_batches": max(MINI_BATCHES, worlds * ACTIONS // MINI_BATCH)}
+            | {
+                "gamma": env.task_class.discount,
+                "num_mini_batches": max(MINI_BATCHES, -(-worlds * ACTIONS // MINI_BATCH)),
+            }
             | _learning_rate(env.task_class.learning_rate),
         }
         with contextlib.redirect_stdout(io.StringIO()):  # it prints its networks
