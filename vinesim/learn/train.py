@@ -35,7 +35,7 @@ MINI_BATCHES = 4
 """Least number of mini-batches of an update of the policy."""
 MINI_BATCH = 8192
 """Largest number of actions in a mini-batch. GUESSED: with four mini-batches of 32,768 actions, 4,096 worlds would
-take few steps of the optimizer for the time that their actions take. Pick was only trained with these."""
+take few steps of the optimizer for the time that their actions take. The two were not compared with equal rewards."""
 LEAST_NOISE = 0.15
 """Deviation of the explored actions above which it may be limited. GUESSED: it moves a hand by less than 0.1 m/s."""
 VINES = 256
