@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from vinesim.avatar import leg_estimator
 from vinesim.avatar.gestures import FIST, OPEN_HAND, shears_grip
 from vinesim.avatar.tracked_human import TrackedHuman, TrackedPoints
 from vinesim.core import frames
@@ -68,6 +69,34 @@ def test_who_is_put_elsewhere_stands_there_at_once(human):
     for _ in range(60):
         points = human(0.0).points[1:]
         np.testing.assert_allclose(points[:, :3] - before[:, :3], np.tile([3.0, 1.0, 0.0], (6, 1)), atol=1e-9)
+
+
+@pytest.mark.parametrize("rate", [90.0, 10.0, 2.5])
+def test_feet_move_no_faster_than_those_of_a_person(human, rate):
+    """At 2.5 inputs a second, as from a slow browser, the head moves by half a metre in a tenth of a second, and stops.
+    A foot that jumped would throw away what it hits."""
+    head = human.pose.head.copy()
+    ahead = frames.rotate(head[3:], np.array([1.0, 0.0, 0.0]))
+    steps = np.arange(0.0, 4.0, DT)
+    walked = 1.2 * np.clip(steps - 0.5, 0.0, 1.5)
+    turned = np.where(steps < 2.5, 0.0, 2.0)
+    feet = []
+    due = 0.0
+    for time, way, yaw in zip(steps, walked, turned, strict=True):
+        if time >= due:
+            due += 1.0 / rate
+            turn = frames.multiply(frames.from_yaw(yaw), head[3:])
+            human.take(TrackedPoints(np.concatenate([head[:3] + way * ahead, turn])))
+        pose = human(time)
+        feet.append(np.stack([pose.left_foot, pose.right_foot]))
+    feet = np.array(feet)
+    speed = np.linalg.norm(np.diff(feet[..., :2], axis=0), axis=-1) / DT
+    turn = frames.multiply(feet[1:, :, 3:], frames.conjugate(feet[:-1, :, 3:]))
+    assert 1.2 < speed.max() <= leg_estimator.MAX_FOOT_SPEED + 1e-9
+    assert np.linalg.norm(frames.log(turn), axis=-1).max() / DT <= leg_estimator.MAX_FOOT_TURN + 1e-9
+    np.testing.assert_allclose(np.diff(feet[..., 2], axis=0), 0.0, atol=0.01)
+    middle = feet[-1, :, :2].mean(0)
+    np.testing.assert_allclose(middle, pose.hips[:2], atol=leg_estimator.STEP_LENGTH, err_msg="they follow")
 
 
 def test_closing_a_hand_and_bending_fingers_pass_through(human):

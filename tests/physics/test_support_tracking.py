@@ -151,6 +151,30 @@ def test_a_remote_object_is_blended_and_a_distant_one_placed():
     np.testing.assert_allclose(tracker.object_state(BOX(0))[0][:3], far[:3], atol=1e-12)
 
 
+def test_a_remote_object_is_not_pressed_into_what_stops_it():
+    """The owner's state is older than the contact: it still falls at 4 m/s, and is below the ground by now. What leads
+    away from the ground and along it applies."""
+    physics = Physics(vineyard())
+    tracker = physics.support_tracker
+    tracker.set_state(BOX(0), frames.pose([-2.0, 0.5, 0.0]), np.zeros(6))
+    run(physics, 10)
+    start = tracker.object_state(BOX(0))[0]
+    goal = start + np.array([0.02, 0.0, -0.04, 0, 0, 0, 0])
+    for _ in range(10):
+        falls = np.array([0.3, 0, -4.0, 0, 0, 0])
+        tracker.blend_towards([BOX(0)], goal[None], falls[None], np.array([0.2]))
+        pose, velocity = tracker.object_state(BOX(0))
+        assert velocity[0] == 0.3
+        assert velocity[2] > -0.1
+        run(physics, 1)
+        assert abs(tracker.object_state(BOX(0))[0][2] - start[2]) < 5e-3
+    assert pose[0] > start[0] + 0.015
+    tracker.blend_towards([BOX(0)], (start + 0.05)[None], np.array([[0, 0, 1.0, 0, 0, 0]]), np.array([0.2]))
+    pose, velocity = tracker.object_state(BOX(0))
+    assert pose[2] > start[2] + 0.008
+    assert velocity[2] == 1.0
+
+
 def test_a_new_bunch_can_be_set_moving_at_once():
     """The first free bunch of a world without boxes is known in the tick in which it is picked remotely."""
     tree = TreeBuilder(frames.pose(np.array([0.5, 0.0, 1.5])))

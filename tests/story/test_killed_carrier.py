@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.support.shared_vineyard import BOX, BUNCH, DT, REACH, World, bytes_sent, pose_of, position_difference
+from tests.support.shared_vineyard import BOX, BUNCH, DT, REACH, World, bytes_sent, pose_of, position_difference, put
 from vinesim.client.client import Client
 from vinesim.core import frames
 
@@ -29,7 +29,7 @@ def load(world: World, ada: Client) -> None:
     tracker = ada.physics.support_tracker
     ada.physics.pick(0)
     hand = frames.compose(base_of(ada), frames.pose([REACH - 0.07, 0.0, 0.95]))
-    tracker.set_state(BOX(1), frames.compose(base_of(ada), frames.pose([0.0, 0.0, 0.253])), np.zeros(6))
+    put(ada, BOX(1), frames.compose(base_of(ada), frames.pose([0.0, 0.0, 0.253])))
     ada.robot.command_position(np.array([0.0, 0.07, 0.07]))
     for _ in range(50):  # rising, so that it does not count as at rest on nothing
         hand[2] += 0.001

@@ -10,11 +10,13 @@ import pytest
 from tests.support.shared_vineyard import (
     BOX,
     BUNCH,
+    DT,
     World,
     bytes_received,
     bytes_sent,
     pose_of,
     position_difference,
+    put,
     vineyard,
 )
 from vinesim.client.client import Client
@@ -139,11 +141,33 @@ def test_a_pushed_box_with_bunches_is_one_stream():
         assert position_difference(ada, bob, number) < 1e-3
 
 
+@pytest.mark.parametrize("height", [0.6, 0.8, 1.0])
+def test_a_bunch_dropped_into_a_box_that_nobody_has_moved_lies_in_it_on_all_clients(height):
+    """The copy of the bunch hits the box before the other client hears that the bunch has stopped. It must not throw
+    the box, because nobody would send the box's pose."""
+    world, ada, bob = two_clients((-2.75, 1.0), (-2.0, -2.0))
+    world.until(lambda: at_rest(world), 3.0)
+    box = pose_of(bob, BOX(0))
+    upright = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
+    ada.physics.pick(0)
+    ada.physics.rigid.place_bunch(0, frames.compose(box, frames.pose([0.02, 0.01, height], upright)), np.zeros(6))
+    world.run(0.1)
+    moved = 0.0
+    while not at_rest(world):
+        world.run(DT)
+        moved = max(moved, float(np.linalg.norm((pose_of(bob, BOX(0)) - box)[:3])))
+        assert world.now < 110.0
+    assert moved < 0.002
+    assert bob.physics.support_tracker.pose_on_support(BUNCH(0))[0] == "box/0"
+    for number in (BOX(0), BUNCH(0)):
+        assert position_difference(ada, bob, number) < 1e-3
+
+
 def test_a_box_on_a_driving_robot_costs_a_record_every_3_m_and_follows_it():
     """F80."""
     world, ada, bob = two_clients((-1.0, -1.0), (1.0, -3.0))
     deck = frames.compose(ada.physics.rigid.base_state("ada")[0], frames.pose([0.0, 0.0, 0.253]))
-    ada.physics.support_tracker.set_state(BOX(1), deck, np.zeros(6))
+    put(ada, BOX(1), deck)
     world.until(lambda: ada.physics.support_tracker.moving, 1.0)
     world.until(lambda: at_rest(world), 3.0)
     world.run(0.2)
@@ -359,7 +383,7 @@ def test_clients_continue_without_the_server_and_agree_afterwards():
 def test_a_box_stays_when_the_robot_that_carries_it_leaves():
     world, ada, bob = two_clients((-1.0, -1.0), (1.0, -2.0))
     deck = frames.compose(ada.physics.rigid.base_state("ada")[0], frames.pose([0.0, 0.0, 0.253]))
-    ada.physics.support_tracker.set_state(BOX(1), deck, np.zeros(6))
+    put(ada, BOX(1), deck)
     world.run(0.2)
     world.until(lambda: at_rest(world), 3.0)
     world.run(0.2)

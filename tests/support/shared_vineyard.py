@@ -169,6 +169,12 @@ def pose_of(client: Client, number: int) -> np.ndarray:
     return client.physics.support_tracker.object_state(number)[0]
 
 
+def put(client: Client, number: int, pose: np.ndarray) -> None:
+    """Put a box or a free bunch at a pose [7], where it moves freely and at first stands still."""
+    client.objects.forget(number)
+    client.physics.support_tracker.set_state(number, pose, np.zeros(6))
+
+
 def position_difference(a: Client, b: Client, number: int) -> float:
     """[m] Distance between the positions of an object on two clients."""
     return float(np.linalg.norm(pose_of(a, number)[:3] - pose_of(b, number)[:3]))

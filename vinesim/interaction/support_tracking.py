@@ -11,6 +11,9 @@ Objects in hands are never at rest.
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Container
+
 import mujoco
 import numpy as np
 
@@ -28,6 +31,12 @@ SHAKEN_BAND = 0.05, float(np.radians(30.0))
 """[m, rad] Band of a bunch in a moving box, in which the bunch rocks and rolls. In a box at rest :data:`STILL_BAND`
 applies. TUNED."""
 
+STOP_STEPS = 15
+"""Number of steps for which a contact limits the corrections of a remote object after it has ended, as long as states
+are extrapolated: an object that bounces has no contact for a few steps."""
+SAME_NORMAL = 0.95
+"""Cosine of the angle below which two contact normals count as one."""
+
 GROUND = ""
 """Name of the ground as a support; boxes are ``box/3``, links ``actor/link``."""
 
@@ -36,6 +45,16 @@ FARTHEST = 1e5
 """Largest coordinate of an object that rests on a support [m], as large as messages may have."""
 _NONE = -1
 _NO_PAIRS = np.zeros((0, 2), np.int64)
+
+
+@dataclasses.dataclass(slots=True)
+class _Stop:
+    """A thing that stops an object which a remote actor moves."""
+
+    normal: np.ndarray
+    """Unit vector [3] away from the thing."""
+    steps_left: int
+    """Number of steps for which it still counts."""
 
 
 class SupportTracker:
@@ -72,6 +91,8 @@ class SupportTracker:
         ``_bands_before`` [object, 2]: band of each object in the last step.
         """
         self._touched: list[tuple[int, str]] | None = None
+        self._stops: dict[int, list[_Stop]] = {}
+        """What has stopped objects that remote actors move, by row."""
         self._all_sleep = False
         """Whether all objects slept after the last step."""
         self._rebuild_tables()
@@ -183,6 +204,12 @@ class SupportTracker:
                     found.add((held, name))
         return sorted(found)
 
+    @property
+    def sleeping(self) -> list[int]:
+        """Objects that MuJoCo does not move, because they and what they touch have been still for some steps."""
+        self._update_tables()
+        return self.object_ids[self.rigid.mj_data.tree_asleep[self._tree] >= 0].tolist()
+
     # ------------------------------------------------------------------ single objects
 
     def __contains__(self, object_id: int) -> bool:
@@ -256,17 +283,74 @@ class SupportTracker:
             wake_body(self.rigid.mj_model, d, body)
         self.rigid.invalidate_kinematics()
 
-    def blend_towards(self, object_ids: list[int], pose: np.ndarray, velocity: np.ndarray, blend: np.ndarray) -> None:
+    def blend_towards(
+        self,
+        object_ids: list[int],
+        pose: np.ndarray,
+        velocity: np.ndarray,
+        blend: np.ndarray,
+        local_actors: Container[str] = (),
+    ) -> None:
         """Move objects [k] towards ``pose`` [k, 7] by the share ``blend`` [k] of the difference, and set their
-        ``velocity`` [k, 6].
+        ``velocity`` [k, 6], except where that would press them harder against things that their owner does not move:
+        the ground, other objects, and ``local_actors``.
 
-        Objects further away than ``support_snap_distance`` get the pose ``pose`` at once.
+        The owner's object may have stopped there already, which is not known here yet. Call it in every step. Objects
+        further away than ``support_snap_distance`` get the pose ``pose`` at once.
         """
-        here = self._poses(np.array([self._row_of(object_id) for object_id in object_ids]))
+        rows = np.array([self._row_of(object_id) for object_id in object_ids])
+        here = self._poses(rows)
         far = np.linalg.norm(pose[:, :3] - here[:, :3], axis=1) > self.rigid.parameters.support_snap_distance
         there = pose.copy()
         there[(here[:, 3:] * pose[:, 3:]).sum(1) < 0.0, 3:] *= -1.0
-        self.set_states(object_ids, here + np.where(far, 1.0, blend)[:, None] * (there - here), velocity)
+        moved = here + np.where(far, 1.0, blend)[:, None] * (there - here)
+        velocity = velocity.copy()
+        place = {row: k for k, row in enumerate(rows.tolist()) if not far[k]}
+        self._remember_stops(place, local_actors)
+        for row, stops in self._stops.items():
+            k = place[row]
+            own = self.rigid.mj_data.qvel[self._v[row] : self._v[row] + 3]
+            for stop in stops:
+                moved[k, :3] -= min(0.0, float((moved[k, :3] - here[k, :3]) @ stop.normal)) * stop.normal
+                velocity[k, :3] -= min(0.0, float((velocity[k, :3] - own) @ stop.normal)) * stop.normal
+        self.set_states(object_ids, moved, velocity)
+
+    def _remember_stops(self, rows: Container[int], local_actors: Container[str]) -> None:
+        """Add the contacts of the last step to what stops ``rows``, and forget old ones."""
+        for stops in self._stops.values():
+            for stop in stops:
+                stop.steps_left -= 1
+        self._stops = {
+            row: [stop for stop in stops if stop.steps_left > 0] for row, stops in self._stops.items() if row in rows
+        }
+        for row, normal in self._contact_normals(rows, local_actors):
+            stops = self._stops.setdefault(row, [])
+            known = next((stop for stop in stops if stop.normal @ normal > SAME_NORMAL), None)
+            if known is None:
+                stops.append(_Stop(normal.copy(), STOP_STEPS))
+            else:
+                known.steps_left = STOP_STEPS
+
+    def _contact_normals(self, rows: Container[int], local_actors: Container[str]) -> list[tuple[int, np.ndarray]]:
+        """Returns the contacts of the last step between one of ``rows`` and a thing that is none of them and belongs to
+        nobody else than ``local_actors``: the row and the unit vector [3] away from the thing."""
+        d = self.rigid.mj_data
+        active = np.flatnonzero(d.contact.efc_address >= 0)
+        bodies = self.rigid.mj_model.geom_bodyid[d.contact.geom[active]]
+        found = []
+        for side in (0, 1):
+            row = self._row_of_body[bodies[:, side]]
+            for k in np.flatnonzero(row >= 0).tolist():
+                other = int(bodies[k, 1 - side])
+                is_actor = self._kind_of_body[other] in (_LINK, _HUMAN)
+                if (
+                    int(row[k]) in rows
+                    and int(self._row_of_body[other]) not in rows
+                    and (not is_actor or self.rigid.owners[other][0] in local_actors)
+                ):
+                    normal = d.contact.frame[active[k], :3]
+                    found.append((int(row[k]), normal if side else -normal))
+        return found
 
     def set_at_rest(self, object_id: int, support: str, relative: np.ndarray) -> None:
         """Set an object at rest with the pose ``relative`` [7] in a support's frame, because the client that owns the
@@ -407,6 +491,7 @@ class SupportTracker:
         self._slow_steps = self._still_steps.copy()
         self._touching_pairs = np.zeros((0, 2), np.int64)
         self._touched = None
+        self._stops = {}
         self._bands_before = self._bands_on_ground = np.tile(STILL_BAND, (len(self.object_ids), 1))
         for number, (support, anchor, still, slow) in known.items():
             if number in self._row_of_object:

@@ -56,7 +56,10 @@ class ObjectSync:
         self._remote_updates: dict[int, ObjectUpdate] = {}
         """Last received state of each object that a remote actor is moving, by object id."""
         self._resting: dict[int, RetainedRecord] = {}
-        """Retained record of each object that is at rest according to its record, by object id."""
+        """Retained record of each object that is at rest according to its record, by object id. Boxes that nobody has
+        moved since the world began have such a record too, though none was published."""
+        self._unmoved: set[int] = set(physics.support_tracker.object_ids.tolist())
+        """Boxes that nobody has moved since the world began, and that have not come to rest yet."""
         self._supported: dict[str, set[int]] = {}
         """Ids of the objects at rest on each parent frame, except the ground, by name of the frame."""
         self._changed_trees: set[int] = set()
@@ -84,7 +87,8 @@ class ObjectSync:
         if updates:
             blend = np.array([BLEND_PER_STEP if number in self._remote_updates else 1.0 for number in updates])
             poses = np.array([update.pose for update in inbox.objects])
-            tracker.blend_towards(list(updates), poses, np.array([update.velocity for update in inbox.objects]), blend)
+            velocities = np.array([update.velocity for update in inbox.objects])
+            tracker.blend_towards(list(updates), poses, velocities, blend, self._local_actors)
             tracker.set_moving(list(updates))
         self._remote_updates = updates
         remote = self.physics.fruit_monitor.remote
@@ -300,6 +304,7 @@ class ObjectSync:
 
     def _clear_resting(self, number: int) -> None:
         """Forget the record of rest of an object."""
+        self._unmoved.discard(number)
         record = self._resting.pop(number, None)
         if record is not None and record.parent != GROUND:
             self._supported[record.parent].discard(number)
@@ -362,6 +367,7 @@ class ObjectSync:
     def collect(self) -> None:
         """Record the detachments of the last step, and update the set of moving objects. Call it after every step."""
         self.physics.support_tracker.update()
+        self._record_starts()
         self._detachments = self.physics.detachments
         for detachment in self._detachments:
             self._changed_trees.add(detachment.tree)
@@ -377,6 +383,17 @@ class ObjectSync:
         self._given = sorted(due | {one.tree for one in self._breakages})
         for tree in self._given:
             self._given_since.pop(tree, None)
+
+    def _record_starts(self) -> None:
+        """Record where boxes have come to rest that nobody has moved since the world began: it is the same place on all
+        clients, unless an actor carries it."""
+        if not self._unmoved:
+            return
+        tracker = self.physics.support_tracker
+        for number in sorted(self._unmoved.intersection(tracker.sleeping)):
+            parent, pose = tracker.pose_on_support(number)
+            if not _carrier(parent):
+                self._set_resting(number, RetainedRecord(number, 0, 0, "", pose=tuple(pose.tolist()), parent=parent))
 
     def detached_by(self, name: str, *, all_others: bool) -> list[int]:
         """Returns the objects that actor ``name`` detached in the last step, and the trees whose wood or ties it broke;
