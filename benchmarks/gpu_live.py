@@ -154,7 +154,8 @@ def measure_camera(report: Report, device: str, seconds: float) -> None:
         for quality in ("fast", "full"):
             camera = Camera(spec, spec.info("optical"), quality=quality, device=device)
             count = 0
-            end = np.inf
+            begin = 0.0
+            end = now = np.inf
             for number in range(1_000_000):
                 eye = np.array([-0.6 + 1e-4 * (number % 1000), 1.0, 1.45])
                 camera.render(primitives, look_at(eye, np.array([8.0, 1.35, 1.45])), outputs=RGBD)

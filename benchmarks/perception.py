@@ -172,7 +172,7 @@ def perception() -> Iterator[Measurement]:
         yield Measurement("perception", f"registration, {sensor}: largest angle of 5", float(np.degrees(angle)), "deg")
     volumes: dict[tuple[str, str], list[float]] = {}
     diameters: dict[str, list[float]] = {one: [] for one in DEPTHS}
-    wrong = dict.fromkeys(DEPTHS, 0)
+    wrong: dict[str, int] = dict.fromkeys(DEPTHS, 0)
     for seen in seen_bunches(simulation, BUNCHES):
         for depth in DEPTHS:
             exact = depth != DEPTHS[2]

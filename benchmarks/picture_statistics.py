@@ -166,8 +166,8 @@ def bunch_shapes(bunches: np.ndarray) -> dict[str, float]:
         area = int(mask.sum())
         if area < LEAST_PIXELS:
             continue
-        parts, count = ndimage.label(mask, np.ones((3, 3)))
-        sizes = np.bincount(parts.ravel(), minlength=count + 1)[1:]
+        _, parts = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+        sizes = np.bincount(parts.ravel())[1:]
         outlines = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
         perimeter = sum(cv2.arcLength(outline, True) for outline in outlines)
         hull = cv2.contourArea(cv2.convexHull(np.concatenate(_corners(mask))))

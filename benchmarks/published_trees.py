@@ -110,7 +110,7 @@ def main() -> None:
     """Print a table of all trees, and how well vinesim reproduces the order and the size of the frequencies."""
     import scipy.io  # scipy belongs to the developers' tools
 
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("fem", type=pathlib.Path, help="clone of WindAndTrees_FEM")
     parser.add_argument("frequencies", type=pathlib.Path, help="clone of WindAndTrees_NaturalFrequencies")
     given = parser.parse_args()

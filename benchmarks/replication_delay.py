@@ -119,7 +119,7 @@ class Pair:
         """For comparison, let every touch take the tree from its owner, again and again."""
         for client in self.clients:
             rule = functools.partial(_grab, client, client.replicator.send)
-            client.replicator.send = rule  # a bench replaces the method
+            vars(client.replicator)["send"] = rule  # hides the method of the class
 
     def tick(self) -> None:
         """Step both clients once."""

@@ -35,7 +35,7 @@ TIMEOUT = 600.0
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--seeds", type=int, default=10, help="vineyards")
     parser.add_argument("--first", type=int, default=1, help="seed of the first vineyard")
     options = parser.parse_args()
@@ -118,6 +118,7 @@ def lies_in_a_box(bunch: str) -> bool:
         answer = service.call_async(GetEntitiesStates.Request(filters=EntityFilters(filter=f"^(box_.*|{bunch})$")))
         rclpy.spin_until_future_complete(node, answer, timeout_sec=30.0)
         found = answer.result()
+        assert found is not None
         poses = {
             name: np.array(
                 [

@@ -184,7 +184,7 @@ def rows(
     learnt, tests = divide(pictures, learn)
     sets = [training_set(text, pictures.synthetic, learnt) for text in train or default_sets(pictures, learnt)]
     yield from _compare(
-        sets, tests, (steps, batch, crop), range(seed, seed + repeats), device, out and pathlib.Path(out)
+        sets, tests, (steps, batch, crop), range(seed, seed + repeats), device, pathlib.Path(out) if out else None
     )
 
 

@@ -138,7 +138,7 @@ def change_colours(pictures: Tensor, rng: np.random.Generator, noise: torch.Gene
     level = x.mean((1, 2, 3), keepdim=True)
     contrast, brightness = rng.uniform(*CONTRAST, count), rng.uniform(-BRIGHTNESS, BRIGHTNESS, count)
     x = ((x - level) * each(contrast) + level + each(brightness)).clamp(1e-4, 1.0)
-    x = x ** each(np.exp(rng.uniform(*np.log(GAMMA), count)))
+    x = x ** each(np.exp(rng.uniform(np.log(GAMMA[0]), np.log(GAMMA[1]), count)))
     sigma = np.where(rng.random(count) < BLUR_SHARE, rng.uniform(*BLUR, count), 0.0)
     x = _blurred(x, torch.tensor(sigma, dtype=torch.float32, device=device))
     strength = np.where(rng.random(count) < NOISE_SHARE, rng.uniform(0.0, NOISE, count), 0.0)

@@ -15,6 +15,7 @@ import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+import cv2
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
@@ -142,9 +143,7 @@ def _numbered(mask: np.ndarray) -> np.ndarray:
     if mask.ndim == 3:
         mask = mask[..., :3].max(-1)
     if len(np.unique(mask)) == 2:
-        from scipy import ndimage
-
-        mask = ndimage.label(mask > mask.min(), np.ones((3, 3)))[0]
+        mask = cv2.connectedComponents((mask > mask.min()).astype(np.uint8), connectivity=8)[1]
     return mask.astype(np.uint16)
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
-from scipy import ndimage
 
 from benchmarks.support.bunch_pictures import BunchPicture
 
@@ -50,10 +50,10 @@ def score_picture(picture: BunchPicture, probability: np.ndarray) -> PictureScor
         part = np.s_[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)]
         in_boxes[part] = True
         hits += bool(is_found[part].size) and is_found[part].mean() >= HIT_SHARE
-    blobs, count = ndimage.label(is_found, np.ones((3, 3)))
-    sizes = np.bincount(blobs.ravel(), minlength=count + 1)
-    is_outside = np.ones(count + 1, bool)
-    is_outside[np.unique(blobs[in_boxes])] = False
+    count, blobs = cv2.connectedComponents(is_found.astype(np.uint8), connectivity=8)
+    sizes = np.bincount(blobs.ravel(), minlength=count)
+    is_outside = np.ones(count, bool)
+    is_outside[np.unique(blobs[in_boxes]).astype(int)] = False
     is_outside[0] = False  # the pixels of no blob
     counts = sizes >= MIN_BLOB_SHARE * is_found.size
     bunch_pixels = other_pixels = None
