@@ -56,6 +56,14 @@ def test_options_that_do_not_fit_are_refused_in_one_line(tmp_path: pathlib.Path)
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize("option", [("--minutes", "0.5"), ("--iterations", "20")])
+def test_an_evaluation_refuses_the_options_of_a_training(option: tuple[str, str]) -> None:
+    done = programs.run(command("reach", "--evaluate", "reach", *option), timeout=TIMEOUT)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert f"{' '.join(option)} with --evaluate reach: nothing is trained; omit {option[0]}" in done.stderr
+
+
 @pytest.mark.skipif(importlib.util.find_spec("rsl_rl") is not None, reason="rsl_rl is installed")
 def test_without_the_libraries_a_training_says_what_to_install(tmp_path: pathlib.Path) -> None:
     done = programs.run(command("reach", "--out", tmp_path / "run"), timeout=TIMEOUT)

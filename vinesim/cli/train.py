@@ -23,6 +23,8 @@ TRAINING_WORLDS = 4096
 EVALUATION_WORLDS = 500
 FULL_PHYSICS_WORLDS = 100
 """Default number of worlds of an evaluation with full physics, which takes them one after the other."""
+TRAINING_ITERATIONS = 300
+"""Default number of updates of a policy in a training."""
 
 
 def run_training(

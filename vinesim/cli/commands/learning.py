@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from vinesim.cli.commands.options import Device
+from vinesim.core.errors import UsageError
 
 
 def train(
@@ -32,8 +33,11 @@ def train(
     device: Device = "cpu",
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of vines, tasks and weights.")] = 1,
     iterations: Annotated[
-        int, typer.Option(min=1, help="Number of updates of the policy; each follows 32 actions in each world.")
-    ] = 300,
+        int | None,
+        typer.Option(
+            min=1, help="Number of updates of the policy, by default 300; each follows 32 actions in each world."
+        ),
+    ] = None,
     minutes: Annotated[
         float | None, typer.Option(min=0.0, help="End the training after this time, even before --iterations [min].")
     ] = None,
@@ -62,9 +66,12 @@ def train(
       vinesim train reach --evaluate run/policy.npz --full-physics
       vinesim train pick --evaluate pick
     """
-    from vinesim.cli.train import run_evaluation, run_training
+    from vinesim.cli.train import TRAINING_ITERATIONS, run_evaluation, run_training
 
     if evaluate is not None:
+        for option, value in (("--iterations", iterations), ("--minutes", minutes)):
+            if value is not None:
+                raise UsageError(f"{option} {value} with --evaluate {evaluate}: nothing is trained; omit {option}")
         raise typer.Exit(
             run_evaluation(
                 task, evaluate, out, worlds, device=device, seed=seed, variation=variation, full=full_physics
@@ -77,7 +84,7 @@ def train(
             worlds,
             device=device,
             seed=seed,
-            iterations=iterations,
+            iterations=iterations or TRAINING_ITERATIONS,
             minutes=minutes,
             variation=variation,
             full=full_physics,
