@@ -49,8 +49,9 @@ def test_a_program_that_does_not_end_is_killed() -> None:
 
 
 STARTS = """
-import subprocess, sys, threading
+import signal, subprocess, sys, threading
 from tests.support import orphans, programs
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
 orphans.end_with_this_process()
 waits = "import subprocess, sys; child = subprocess.Popen(['sleep', 'infinity'], start_new_session=True); "
 waits += "print(child.pid, flush=True); child.wait()"
