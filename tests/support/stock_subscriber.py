@@ -81,7 +81,8 @@ class StockSubscriber:
         assert self.process.stdout is not None
         self.process.stdin.close()
         text = self.process.stdout.read()
-        self.process.wait()
+        code = self.process.wait()
+        assert text, f"the program ended with {code}"
         return json.loads(text)
 
 
