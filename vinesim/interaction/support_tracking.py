@@ -12,7 +12,7 @@ Objects in hands are never at rest.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Container
+from collections.abc import Collection, Container, Iterator
 
 import mujoco
 import numpy as np
@@ -315,7 +315,7 @@ class SupportTracker:
                 velocity[k, :3] -= min(0.0, float((velocity[k, :3] - own) @ stop.normal)) * stop.normal
         self.set_states(object_ids, moved, velocity)
 
-    def _remember_stops(self, rows: Container[int], local_actors: Container[str]) -> None:
+    def _remember_stops(self, rows: Collection[int], local_actors: Container[str]) -> None:
         """Add the contacts of the last step to what stops ``rows``, and forget old ones."""
         for stops in self._stops.values():
             for stop in stops:
@@ -327,30 +327,25 @@ class SupportTracker:
             stops = self._stops.setdefault(row, [])
             known = next((stop for stop in stops if stop.normal @ normal > SAME_NORMAL), None)
             if known is None:
-                stops.append(_Stop(normal.copy(), STOP_STEPS))
+                stops.append(_Stop(normal, STOP_STEPS))
             else:
                 known.steps_left = STOP_STEPS
 
-    def _contact_normals(self, rows: Container[int], local_actors: Container[str]) -> list[tuple[int, np.ndarray]]:
-        """Returns the contacts of the last step between one of ``rows`` and a thing that is none of them and belongs to
+    def _contact_normals(self, rows: Collection[int], local_actors: Container[str]) -> Iterator[tuple[int, np.ndarray]]:
+        """Yields the contacts of the last step between one of ``rows`` and a thing that is none of them and belongs to
         nobody else than ``local_actors``: the row and the unit vector [3] away from the thing."""
         d = self.rigid.mj_data
         active = np.flatnonzero(d.contact.efc_address >= 0)
         bodies = self.rigid.mj_model.geom_bodyid[d.contact.geom[active]]
-        found = []
-        for side in (0, 1):
-            row = self._row_of_body[bodies[:, side]]
-            for k in np.flatnonzero(row >= 0).tolist():
+        row = self._row_of_body[bodies]
+        is_remote = np.zeros(len(self.object_ids) + 1, bool)  # the last one is for row -1, which is no object
+        is_remote[list(rows)] = True
+        for side, sign in ((0, -1.0), (1, 1.0)):  # MuJoCo's normals lead from the first geom to the second
+            for k in np.flatnonzero(is_remote[row[:, side]] & ~is_remote[row[:, 1 - side]]).tolist():
                 other = int(bodies[k, 1 - side])
                 is_actor = self._kind_of_body[other] in (_LINK, _HUMAN)
-                if (
-                    int(row[k]) in rows
-                    and int(self._row_of_body[other]) not in rows
-                    and (not is_actor or self.rigid.owners[other][0] in local_actors)
-                ):
-                    normal = d.contact.frame[active[k], :3]
-                    found.append((int(row[k]), normal if side else -normal))
-        return found
+                if not is_actor or self.rigid.owners[other][0] in local_actors:
+                    yield int(row[k, side]), sign * d.contact.frame[active[k], :3]
 
     def set_at_rest(self, object_id: int, support: str, relative: np.ndarray) -> None:
         """Set an object at rest with the pose ``relative`` [7] in a support's frame, because the client that owns the
