@@ -207,7 +207,7 @@ def test_only_an_actor_that_has_joined_offers_and_only_right_keys_are_answered()
     with Server("tcp/127.0.0.1:0") as server, ZenohBus("anna", connect=server.endpoint) as anna:
         assert anna.fetch("offer/anna", begin) == []  # it has not joined
         anna.join(encode_hello(Hello("anna", digest="D", scene="demo")))
-        assert anna.admissions == 1
+        assert anna.admissions  # it joins again if Zenoh reports only then that the server is there
         (reply,) = anna.fetch("offer/anna", begin)
         assert decode_wanted(reply) == MeshWanted(0)
         request = encode_request(0)
