@@ -167,6 +167,7 @@ def test_no_message_of_an_impostor_is_accepted_under_another_name(server: Server
         assert server.store.count() == 2
         received = send_last(publishers, bob, 3)
         assert record(2) not in {payload for _, payload in received}
+        assert len(received) == len(set(received)), "none arrives twice"
         wait(lambda: server.store.count() == 3, "ada's next record")
 
 
